@@ -1,0 +1,2 @@
+//! The `mobilebrick` command.
+fn main() {}

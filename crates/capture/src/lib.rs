@@ -1,0 +1,15 @@
+//! Sequences on disk: the published MobileBrick layout and what this project adds beside it.
+//!
+//! [`Sequence::open`] reads the index of a sequence folder (frames, poses, intrinsics) and checks it; images and depth
+//! are read frame by frame through its methods, so memory stays bounded whatever the frame count. All cameras that
+//! leave this crate are OpenCV-style and metric (`docs/formats.md` has the layout file by file).
+
+mod alignment;
+mod keypoints;
+mod matrix_txt;
+mod sequence;
+
+pub use alignment::{Alignment, AlignmentStage, FrameAlignment};
+pub use keypoints::{Keypoint, Keypoints};
+pub use matrix_txt::{read_intrinsics_txt, read_pose_txt, write_intrinsics_txt, write_pose_txt};
+pub use sequence::{Frame, FrameId, Sequence, SequenceMeta};

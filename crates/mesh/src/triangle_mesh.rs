@@ -1,0 +1,57 @@
+//! The mesh type.
+
+use mb_geometry::{Aabb, Rigid3};
+use nalgebra::{Point3, Vector3};
+
+/// An indexed triangle mesh. Triangles are counter-clockwise seen from outside. A mesh without triangles is a point
+/// cloud.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct TriangleMesh {
+    /// `[V]` positions in metres (the mesh's owner says in which frame).
+    pub vertices: Vec<Point3<f64>>,
+    /// `[T]` vertex indices.
+    pub triangles: Vec<[u32; 3]>,
+    /// `[V]` 8-bit sRGB, where the mesh is coloured per vertex.
+    pub vertex_colors: Option<Vec<[u8; 3]>>,
+    /// `[T]` 8-bit sRGB, where the mesh is coloured per triangle.
+    pub triangle_colors: Option<Vec<[u8; 3]>>,
+    /// `[T]` index of the part instance (brick) that a triangle belongs to.
+    pub triangle_parts: Option<Vec<u32>>,
+}
+
+impl TriangleMesh {
+    /// A mesh of positions and triangles alone.
+    pub fn new(vertices: Vec<Point3<f64>>, triangles: Vec<[u32; 3]>) -> Self {
+        Self { vertices, triangles, ..Self::default() }
+    }
+
+    /// The corners of triangle `index`.
+    pub fn triangle(&self, index: usize) -> [Point3<f64>; 3] {
+        self.triangles[index].map(|v| self.vertices[v as usize])
+    }
+
+    /// Twice the area of triangle `index` times its unit normal.
+    pub fn scaled_normal(&self, index: usize) -> Vector3<f64> {
+        let [a, b, c] = self.triangle(index);
+        (b - a).cross(&(c - a))
+    }
+
+    /// Sum of the triangles' areas, square metres.
+    pub fn area(&self) -> f64 {
+        (0..self.triangles.len()).map(|t| 0.5 * self.scaled_normal(t).norm()).sum()
+    }
+
+    /// The box around all vertices.
+    pub fn bounds(&self) -> Aabb {
+        Aabb::of(&self.vertices)
+    }
+
+    /// The same mesh in another frame.
+    #[must_use]
+    pub fn transformed<To, From>(mut self, to_from_from: &Rigid3<To, From>) -> Self {
+        for v in &mut self.vertices {
+            *v = *to_from_from * *v;
+        }
+        self
+    }
+}
