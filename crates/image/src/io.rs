@@ -6,7 +6,7 @@ use std::path::Path;
 
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{DynamicImage, ExtendedColorType, ImageEncoder, ImageReader};
+use image::{ColorType, DynamicImage, ExtendedColorType, ImageEncoder, ImageReader};
 use mb_geometry::ImageSize;
 use mb_job::{InputError, Result, write_atomic_with};
 
@@ -70,18 +70,55 @@ pub fn read_rgb(path: impl AsRef<Path>) -> Result<RgbImage> {
     Ok(with_size(size, pixels))
 }
 
+/// Reads a PNG or JPEG photograph as sRGB fractions of full scale, in [0, 1], keeping all bits: 8-bit values are
+/// divided by 255, 16-bit values by 65535. Grey is spread over the channels; an alpha channel must be opaque throughout.
+///
+/// # Errors
+/// The file is missing, damaged, no PNG or JPEG, or transparent somewhere (its colour would depend on what lies behind).
+pub fn read_rgb_fraction(path: impl AsRef<Path>) -> Result<Image<[f32; 3]>> {
+    let path = path.as_ref();
+    let image = decode(path)?;
+    let size = size_of(&image);
+    if image.color().has_alpha() {
+        let alpha = image.to_rgba16();
+        if let Some((x, y, _)) = alpha.enumerate_pixels().find(|(_, _, p)| p[3] != u16::MAX) {
+            return Err(InputError::new(path, "the image is transparent here, so its colour is not defined")
+                .at(format!("pixel ({x}, {y})"))
+                .help("Put it over the background that it should be seen against, and save it without alpha")
+                .into());
+        }
+    }
+    let pixels = if matches!(image.color(), ColorType::L16 | ColorType::La16 | ColorType::Rgb16 | ColorType::Rgba16) {
+        image
+            .into_rgb16()
+            .into_raw()
+            .chunks_exact(3)
+            .map(|p| [p[0], p[1], p[2]].map(|v| f32::from(v) / 65535.0))
+            .collect()
+    } else {
+        image.into_rgb8().into_raw().chunks_exact(3).map(|p| [p[0], p[1], p[2]].map(|v| f32::from(v) / 255.0)).collect()
+    };
+    Ok(with_size(size, pixels))
+}
+
 /// Reads a depth map: a 16-bit grey PNG in millimetres, 0 = no value. Returns metres.
 ///
 /// # Errors
 /// The file is missing, damaged, or not 16-bit grey.
 pub fn read_depth_png(path: impl AsRef<Path>) -> Result<DepthImage> {
+    Ok(read_depth_png_mm(path)?.map(|&mm| f32::from(mm) * 1e-3))
+}
+
+/// Reads a depth map as the whole millimetres on disk, 0 = no value.
+///
+/// # Errors
+/// The file is missing, damaged, or not 16-bit grey.
+pub fn read_depth_png_mm(path: impl AsRef<Path>) -> Result<Image<u16>> {
     let path = path.as_ref();
     let image = decode(path)?;
     let size = size_of(&image);
     match image {
-        DynamicImage::ImageLuma16(grey) => {
-            Ok(with_size(size, grey.into_raw().into_iter().map(|mm| f32::from(mm) * 1e-3).collect()))
-        }
+        DynamicImage::ImageLuma16(grey) => Ok(with_size(size, grey.into_raw())),
         other => Err(InputError::new(path, format!("a depth map must be 16-bit grey, this is {:?}", other.color()))
             .help("Depth is stored as a 16-bit PNG in millimetres, 0 = no value")
             .into()),
