@@ -52,7 +52,9 @@ fn test(root: &Path) -> Result<(), String> {
     let _ = std::fs::remove_file(&log);
     match skipped.lines().count() {
         0 => println!("no test was skipped: the real inputs were there"),
-        n => println!("{n} real inputs were absent, and their tests were SKIPPED:\n{skipped}Set MOBILEBRICK_TEST_DATA to the folder that holds them."),
+        n => println!(
+            "{n} real inputs were absent, and their tests were SKIPPED:\n{skipped}Set MOBILEBRICK_TEST_DATA to the folder that holds them."
+        ),
     }
     run
 }

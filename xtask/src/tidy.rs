@@ -54,12 +54,17 @@ fn arrows(root: &Path, architecture: &str, complaints: &mut Vec<String>) -> Resu
             vec![root.join("xtask/Cargo.toml")]
         } else {
             let entries = fs::read_dir(root.join(room)).map_err(|e| format!("{room}: {e}"))?;
-            let mut paths: Vec<_> = entries.flatten().map(|e| e.path().join("Cargo.toml")).filter(|p| p.exists()).collect();
+            let mut paths: Vec<_> =
+                entries.flatten().map(|e| e.path().join("Cargo.toml")).filter(|p| p.exists()).collect();
             paths.sort();
             paths
         };
         for manifest in manifests {
-            let folder = manifest.parent().and_then(Path::file_name).map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+            let folder = manifest
+                .parent()
+                .and_then(Path::file_name)
+                .map(|n| n.to_string_lossy().into_owned())
+                .unwrap_or_default();
             let text = read(&manifest)?;
             let shown = manifest.strip_prefix(root).unwrap_or(&manifest).display().to_string();
             if !text.contains("[lints]\nworkspace = true") {
@@ -76,7 +81,8 @@ fn arrows(root: &Path, architecture: &str, complaints: &mut Vec<String>) -> Resu
             seen.insert(folder.clone());
             for to in dependencies(&text) {
                 if !uses.contains(&to) {
-                    complaints.push(format!("{shown}: the arrow {folder} -> {to} is not in the table of ARCHITECTURE.md"));
+                    complaints
+                        .push(format!("{shown}: the arrow {folder} -> {to} is not in the table of ARCHITECTURE.md"));
                 }
             }
         }
@@ -169,7 +175,8 @@ mod tests {
 
     #[test]
     fn the_table_is_read_and_upward_arrows_are_found() {
-        let table = "x\n| crate | may use | knows nothing of |\n|---|---|---|\n| `a` | - | files |\n| `b` | `a` | x |\n\nend";
+        let table =
+            "x\n| crate | may use | knows nothing of |\n|---|---|---|\n| `a` | - | files |\n| `b` | `a` | x |\n\nend";
         let allowed = allowed_arrows(table).unwrap();
         assert_eq!(allowed["a"], BTreeSet::new());
         assert_eq!(allowed["b"], BTreeSet::from(["a".to_owned()]));
@@ -178,7 +185,8 @@ mod tests {
 
     #[test]
     fn only_ordinary_dependencies_are_arrows() {
-        let manifest = "[dependencies]\nmb-job.workspace = true\nserde = \"1\"\n[dev-dependencies]\nmb-eval.workspace = true\n";
+        let manifest =
+            "[dependencies]\nmb-job.workspace = true\nserde = \"1\"\n[dev-dependencies]\nmb-eval.workspace = true\n";
         assert_eq!(dependencies(manifest), ["job"]);
     }
 }
