@@ -222,11 +222,12 @@ impl BlockUpdater<'_> {
         if !(u >= -0.5 && v >= -0.5 && u < width as f32 - 0.5 && v < height as f32 - 0.5) {
             return None;
         }
-        let (x, y) = (u.max(0.0) as usize, v.max(0.0) as usize);
-        let (a, b) = (u.max(0.0) - x as f32, v.max(0.0) - y as f32);
         let data = self.depth.data();
-        let first = y * width + x;
-        if x + 1 < width && y + 1 < height {
+        if width > 1 && height > 1 {
+            // In the outer half of a border pixel this extrapolates.
+            let (x, y) = ((u as usize).min(width - 2), (v as usize).min(height - 2));
+            let (a, b) = (u - x as f32, v - y as f32);
+            let first = y * width + x;
             let [p, q] = [data[first], data[first + 1]];
             let [r, s] = [data[first + width], data[first + width + 1]];
             let low = p.min(q).min(r.min(s));
@@ -237,9 +238,7 @@ impl BlockUpdater<'_> {
                 return Some(top + (bottom - top) * b);
             }
         }
-        let x = (x + usize::from(a >= 0.5)).min(width - 1);
-        let y = (y + usize::from(b >= 0.5)).min(height - 1);
-        let nearest = data[y * width + x];
+        let nearest = data[(v + 0.5) as usize * width + (u + 0.5) as usize];
         is_depth(nearest).then_some(nearest)
     }
 }

@@ -183,3 +183,77 @@ fn without_unused_vertices(mesh: TriangleMesh) -> TriangleMesh {
     result.vertex_colors = mesh.vertex_colors.map(|colors| kept.iter().map(|&v| colors[v]).collect());
     result
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use rand::RngExt;
+
+    use super::*;
+
+    /// A volume of 3x3x3 blocks around the origin, each voxel from its position in voxels (0 to 23).
+    fn volume(mut distance: impl FnMut([usize; 3]) -> Option<f32>) -> TsdfVolume {
+        let mut volume = TsdfVolume::new(0.01, 0.04).unwrap();
+        for block in 0..27usize {
+            let at = [block % 3, block / 3 % 3, block / 9];
+            let block = volume.add_block(at.map(|c| c as i32 - 1));
+            for voxel in 0..VOXELS {
+                let inner = [voxel % SIDE, voxel / SIDE % SIDE, voxel / (SIDE * SIDE)];
+                if let Some(d) = distance(std::array::from_fn(|a| at[a] * SIDE + inner[a])) {
+                    block.distance_m[voxel] = d;
+                    block.weight[voxel] = 1.0;
+                }
+            }
+        }
+        volume
+    }
+
+    /// Uses of each directed edge.
+    fn directed_edges(mesh: &TriangleMesh) -> BTreeMap<(u32, u32), usize> {
+        let mut uses = BTreeMap::new();
+        for &[a, b, c] in &mesh.triangles {
+            for edge in [(a, b), (b, c), (c, a)] {
+                *uses.entry(edge).or_insert(0) += 1;
+            }
+        }
+        uses
+    }
+
+    #[test]
+    fn noise_inside_a_closed_border_becomes_a_closed_manifold_across_blocks() {
+        for seed in 0..20 {
+            let mut rng = mb_job::rng(seed, 0);
+            let mesh = volume(|at| {
+                let border = at.iter().any(|&c| c == 0 || c == 3 * SIDE - 1);
+                Some(if border { 0.01 } else { rng.random_range(-0.01..0.01) })
+            })
+            .extract_mesh(1.0);
+            assert!(mesh.triangles.len() > 1000);
+            let edges = directed_edges(&mesh);
+            for (&(a, b), &uses) in &edges {
+                assert_eq!(uses, 1, "seed {seed}: edge {a}-{b} has {uses} triangles on one side");
+                assert_eq!(edges.get(&(b, a)), Some(&1), "seed {seed}: edge {a}-{b} is open");
+            }
+        }
+    }
+
+    #[test]
+    fn unseen_voxels_leave_a_hole_and_no_stray_vertices() {
+        let plane = |at: [usize; 3]| 0.01 * (at[2] as f32 - 11.3);
+        let whole = volume(|at| Some(plane(at))).extract_mesh(1.0);
+        let holed = volume(|at| (at[..2] != [7, 8]).then(|| plane(at))).extract_mesh(1.0);
+        assert_eq!(whole.triangles.len(), 2 * 23 * 23);
+        // The four cells around the missing column are gone.
+        assert_eq!(holed.triangles.len(), whole.triangles.len() - 8);
+        assert_eq!(holed.vertices.len(), whole.vertices.len() - 1);
+        assert!(volume(|at| Some(plane(at))).extract_mesh(2.0).triangles.is_empty());
+    }
+
+    #[test]
+    fn voxels_exactly_on_the_surface_do_not_collapse_triangles() {
+        let mesh = volume(|at| Some(0.01 * (at[2] as f32 - 11.0))).extract_mesh(1.0);
+        assert_eq!(mesh.triangles.len(), 2 * 23 * 23);
+        assert!((0..mesh.triangles.len()).all(|t| mesh.scaled_normal(t).z > 0.9e-4));
+    }
+}

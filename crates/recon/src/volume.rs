@@ -100,6 +100,14 @@ impl TsdfVolume {
         self.index.get(&coord).copied()
     }
 
+    /// Adds an empty block where there is none yet.
+    pub(crate) fn add_block(&mut self, coord: [i32; 3]) -> &mut Block {
+        let number = self.blocks.len();
+        self.index.insert(coord, number as u32);
+        self.blocks.push(Block::new(coord, self.colored));
+        &mut self.blocks[number]
+    }
+
     /// Makes the blocks within the truncation of what a depth map shows, without changing any distance. Announcing all
     /// frames before the first [`TsdfVolume::integrate`] lets every frame clear the free space that it saw in blocks
     /// that only later frames fill.
@@ -120,8 +128,7 @@ impl TsdfVolume {
             return Err(too_large(self.voxel_size_m));
         }
         for coord in new {
-            self.index.insert(coord, self.blocks.len() as u32);
-            self.blocks.push(Block::new(coord, self.colored));
+            self.add_block(coord);
         }
         Ok(())
     }
