@@ -1,0 +1,265 @@
+//! Blue-noise points on surfaces: weighted sample elimination.
+//!
+//! Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets", Computer Graphics Forum 34(2), 2015, with the
+//! parameters and the weight of Open3D 0.19 (`SamplePointsPoissonDisk`), which the published scorer calls.
+
+use mb_geometry::Aabb;
+use nalgebra::Point3;
+use rayon::prelude::*;
+
+use crate::{TriangleMesh, sample_uniform};
+
+/// Uniform samples per wanted point, from which the points are chosen (Open3D's `init_factor`).
+const CANDIDATES_PER_POINT: usize = 5;
+/// `r_min` of the weight as a share of `r_max`, before the correction for the candidates' density (paper, section 4.1).
+const BETA: f64 = 0.5;
+const GAMMA: f64 = 1.5;
+
+/// `n` points of the surface that keep their distance from each other: of `5 n` area-uniform candidates the most crowded
+/// one is removed until `n` are left. Empty where the mesh has no area. The same seed gives the same points.
+pub fn sample_poisson_disk(mesh: &TriangleMesh, n: usize, seed: u64) -> Vec<Point3<f64>> {
+    let candidates: Vec<Point3<f64>> =
+        sample_uniform(mesh, CANDIDATES_PER_POINT * n, seed).into_iter().map(|s| s.point).collect();
+    if candidates.is_empty() {
+        return candidates;
+    }
+    let area: f64 =
+        (0..mesh.triangles.len()).map(|t| 0.5 * mesh.scaled_normal(t).norm()).filter(|a| a.is_finite()).sum();
+    // Largest radius at which n discs can cover the area in a hexagonal packing, doubled (paper, eq. 2 and 3).
+    let reach = 2.0 * (area / n as f64 / (2.0 * 3f64.sqrt())).sqrt();
+    eliminate(&candidates, n, reach)
+}
+
+/// Removes the most crowded of `candidates` until `n` are left; the survivors keep their order.
+fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64>> {
+    let ratio = n as f64 / candidates.len() as f64;
+    let floor = BETA * (1.0 - ratio.powf(GAMMA));
+    let (order, grid) = Grid::new(candidates, reach);
+    let count = order.len();
+    let crowding = |squared: f64| {
+        // (1 - d / reach)^8, squared three times; distances are in units of the reach.
+        let w = 1.0 - squared.sqrt().max(floor);
+        let w = w * w;
+        let w = w * w;
+        w * w
+    };
+    let mut weights: Vec<f64> = (0..count)
+        .into_par_iter()
+        .with_min_len(4096)
+        .map(|i| {
+            let mut weight = 0.0;
+            grid.neighbours(i, |_, squared| weight += crowding(squared));
+            // The point itself is no neighbour.
+            weight - crowding(0.0)
+        })
+        .collect();
+
+    // Weights only ever fall. So the heap may keep old, too large ones: an entry is brought up to date when it comes to
+    // the top, and only an entry that stays there is removed.
+    let mut heap: Vec<(f64, u32)> = weights.iter().zip(0..).map(|(&w, i)| (w, i)).collect();
+    for i in (0..count / 2).rev() {
+        sift_down(&mut heap, i);
+    }
+    let mut kept = vec![true; count];
+    let mut left = count;
+    while left > n {
+        let (old, i) = heap[0];
+        let weight = weights[i as usize];
+        if weight < old {
+            heap[0].0 = weight;
+            sift_down(&mut heap, 0);
+            continue;
+        }
+        kept[i as usize] = false;
+        left -= 1;
+        grid.neighbours(i as usize, |j, squared| weights[j] -= crowding(squared));
+        let last = heap.len() - 1;
+        heap.swap(0, last);
+        heap.pop();
+        sift_down(&mut heap, 0);
+    }
+    let mut survivors: Vec<u32> = order.into_iter().zip(kept).filter(|(_, kept)| *kept).map(|(i, _)| i).collect();
+    survivors.sort_unstable();
+    survivors.into_iter().map(|i| candidates[i as usize]).collect()
+}
+
+/// Moves the entry at `i` down to its place in a heap whose largest entry is first. Equal weights: lowest index first.
+fn sift_down(heap: &mut [(f64, u32)], mut i: usize) {
+    let above = |a: &(f64, u32), b: &(f64, u32)| a.0 > b.0 || (a.0 == b.0 && a.1 < b.1);
+    loop {
+        let left = 2 * i + 1;
+        if left >= heap.len() {
+            return;
+        }
+        let right = left + 1;
+        let larger = if right < heap.len() && above(&heap[right], &heap[left]) { right } else { left };
+        if !above(&heap[larger], &heap[i]) {
+            return;
+        }
+        heap.swap(i, larger);
+        i = larger;
+    }
+}
+
+/// Points sorted into cubic cells at least as wide as the reach, so that all neighbours lie in 27 cells. Only cells with
+/// points are stored, sorted by z, y, x: three cells in a row along x are one run of points.
+struct Grid {
+    /// Points in cell order, in units of the reach, from the corner of the grid.
+    points: Vec<[f64; 3]>,
+    cell_of_point: Vec<u32>,
+    /// For each cell, the nine runs of points (first, end) in the cells around it.
+    runs: Vec<[(u32, u32); 9]>,
+}
+
+/// Bits of a cell's coordinate along one axis.
+const AXIS_BITS: u32 = 21;
+
+impl Grid {
+    /// Sorts the points; returns their order too.
+    fn new(points: &[Point3<f64>], reach: f64) -> (Vec<u32>, Self) {
+        let bounds = Aabb::of(points);
+        let extent = bounds.extent().max() / reach;
+        let cells_per_reach = (f64::from(1 << (AXIS_BITS - 1)) / extent).min(1.0);
+        let in_reaches = |p: &Point3<f64>| (p - bounds.min) / reach;
+        let key_of = |p: &Point3<f64>| {
+            // One empty cell before the first, so that every cell has a neighbour before it.
+            let cell = in_reaches(p).map(|v| (v * cells_per_reach) as u64 + 1);
+            cell.z << (2 * AXIS_BITS) | cell.y << AXIS_BITS | cell.x
+        };
+        let mut sorted: Vec<(u64, u32)> = points.par_iter().enumerate().map(|(i, p)| (key_of(p), i as u32)).collect();
+        sorted.par_sort_unstable();
+
+        let mut keys = Vec::new();
+        let mut starts = Vec::new();
+        let mut cell_of_point = Vec::with_capacity(points.len());
+        for (at, &(key, _)) in sorted.iter().enumerate() {
+            if keys.last() != Some(&key) {
+                keys.push(key);
+                starts.push(at as u32);
+            }
+            cell_of_point.push(keys.len() as u32 - 1);
+        }
+        starts.push(points.len() as u32);
+
+        let mut runs = vec![[(0, 0); 9]; keys.len()];
+        for row in 0..9 {
+            let (dy, dz) = (row % 3, row / 3);
+            // Keys ascend, and so do those of the neighbours: two fingers move through the list once.
+            let (mut first, mut end) = (0, 0);
+            for (&key, runs) in keys.iter().zip(&mut runs) {
+                let middle = key + (dz << (2 * AXIS_BITS)) + (dy << AXIS_BITS);
+                let middle = middle - (1 << (2 * AXIS_BITS)) - (1 << AXIS_BITS);
+                while first < keys.len() && keys[first] < middle - 1 {
+                    first += 1;
+                }
+                while end < keys.len() && keys[end] <= middle + 1 {
+                    end += 1;
+                }
+                runs[row as usize] = (starts[first], starts[end.max(first)]);
+            }
+        }
+        let order: Vec<u32> = sorted.into_iter().map(|(_, i)| i).collect();
+        let points = order.iter().map(|&i| in_reaches(&points[i as usize]).into()).collect();
+        (order, Self { points, cell_of_point, runs })
+    }
+
+    /// Calls `neighbour(index in cell order, squared distance in reaches)` for every point nearer than the reach,
+    /// point `i` itself included.
+    fn neighbours(&self, i: usize, mut neighbour: impl FnMut(usize, f64)) {
+        let [x, y, z] = self.points[i];
+        for &(first, end) in &self.runs[self.cell_of_point[i] as usize] {
+            let run = first as usize..end as usize;
+            for (j, p) in run.clone().zip(&self.points[run]) {
+                let (dx, dy, dz) = (p[0] - x, p[1] - y, p[2] - z);
+                let squared = dx * dx + dy * dy + dz * dz;
+                if squared < 1.0 {
+                    neighbour(j, squared);
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::KdTree;
+
+    fn square(side: f64) -> TriangleMesh {
+        let corners = [[0., 0., 0.], [side, 0., 0.], [side, side, 0.], [0., side, 0.]].map(Point3::from);
+        TriangleMesh::new(corners.to_vec(), vec![[0, 1, 2], [0, 2, 3]])
+    }
+
+    /// Distance of each point from its nearest other point.
+    fn gaps(points: &[Point3<f64>]) -> Vec<f64> {
+        let tree = KdTree::new(points);
+        points
+            .iter()
+            .enumerate()
+            .map(|(i, p)| {
+                let mut reach = 0.02;
+                loop {
+                    let others = tree.within(p, reach).into_iter().filter(|&(j, _)| j != i).map(|(_, d)| d);
+                    if let Some(nearest) = others.min_by(f64::total_cmp) {
+                        break nearest;
+                    }
+                    reach *= 2.0;
+                }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn points_keep_their_distance() {
+        let n = 2000;
+        let points = sample_poisson_disk(&square(1.0), n, 3);
+        assert_eq!(points.len(), n);
+        let reach = 2.0 * (1.0 / n as f64 / (2.0 * 3f64.sqrt())).sqrt();
+        let gaps = gaps(&points);
+        let mean = gaps.iter().sum::<f64>() / n as f64;
+        let least = gaps.iter().copied().fold(f64::INFINITY, f64::min);
+        // Random points have a mean gap of 0.5 / sqrt(n) = 0.46 reaches, and a least gap of nearly 0.
+        assert!((mean / reach - 0.75).abs() < 0.02, "{}", mean / reach);
+        assert!(least / reach > 0.4, "{}", least / reach);
+    }
+
+    /// The same elimination without grid, heap or updates: recompute everything, remove the most crowded.
+    #[test]
+    fn the_most_crowded_goes_first() {
+        let candidates: Vec<Point3<f64>> = sample_uniform(&square(1.0), 150, 5).into_iter().map(|s| s.point).collect();
+        let (n, reach) = (30, 0.2);
+        let floor = 0.5 * (1.0 - (n as f64 / 150.0).powf(1.5)) * reach;
+        let mut left: Vec<usize> = (0..150).collect();
+        while left.len() > n {
+            let crowding = |&i: &usize| -> f64 {
+                let others = left.iter().filter(|&&j| j != i).map(|&j| (candidates[i] - candidates[j]).norm());
+                others.filter(|&d| d < reach).map(|d| (1.0 - d.max(floor) / reach).powi(8)).sum()
+            };
+            let worst = *left.iter().max_by(|a, b| crowding(a).total_cmp(&crowding(b))).unwrap();
+            left.retain(|&i| i != worst);
+        }
+        let expected: Vec<Point3<f64>> = left.into_iter().map(|i| candidates[i]).collect();
+        assert_eq!(eliminate(&candidates, n, reach), expected);
+    }
+
+    #[test]
+    fn the_seed_decides_and_a_mesh_without_area_has_none() {
+        let mesh = square(0.1);
+        assert_eq!(sample_poisson_disk(&mesh, 500, 1), sample_poisson_disk(&mesh, 500, 1));
+        assert_ne!(sample_poisson_disk(&mesh, 500, 1), sample_poisson_disk(&mesh, 500, 2));
+        assert!(sample_poisson_disk(&TriangleMesh::default(), 10, 0).is_empty());
+        assert!(sample_poisson_disk(&mesh, 0, 0).is_empty());
+    }
+
+    /// Two far apart pieces: more cells between them than keys can number.
+    #[test]
+    fn sparse_scenes_are_no_trouble() {
+        let mut mesh = square(0.01);
+        let far: Vec<_> = mesh.vertices.iter().map(|p| p + nalgebra::Vector3::new(1e6, 0.0, -1e6)).collect();
+        mesh.vertices.extend(far);
+        mesh.triangles.extend([[4, 5, 6], [4, 6, 7]]);
+        let points = sample_poisson_disk(&mesh, 1000, 0);
+        let near = points.iter().filter(|p| p.x < 1.0).count();
+        assert!((450..=550).contains(&near), "{near}");
+    }
+}
