@@ -302,7 +302,7 @@ impl Sequence {
 }
 
 /// Files `NNNNNN.EXT` of a folder, in ascending order. An absent folder has none; other names are not frames.
-fn numbered_files(folder: &Path, extensions: &[&str]) -> Result<Vec<(FrameId, PathBuf)>> {
+pub(crate) fn numbered_files(folder: &Path, extensions: &[&str]) -> Result<Vec<(FrameId, PathBuf)>> {
     let entries = match std::fs::read_dir(folder) {
         Ok(entries) => entries,
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
