@@ -1,0 +1,249 @@
+//! `align keypoints`: the object's pose from what a person clicked.
+
+use std::path::{Path, PathBuf};
+
+use mb_capture::{Alignment, AlignmentStage, FrameId, Keypoints, Sequence};
+use mb_geometry::{Object, Rigid3, World};
+use mb_job::{Error, InputError, Progress, Result, Steps};
+use nalgebra::{Matrix6, Point2};
+use serde::{Deserialize, Serialize};
+
+use crate::output::begin_stage;
+use crate::pnp::{Correspondence, PnpError, PnpOptions, PointLayout, PoseEstimate, PosedCamera, estimate_pose};
+
+/// How `align_keypoints` works.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct KeypointOptions {
+    /// The pose estimate.
+    pub pnp: PnpOptions,
+}
+
+/// What came out, for people and programs.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct KeypointSummary {
+    /// Clicked points.
+    pub points: usize,
+    /// Frames that were clicked in.
+    pub frames: usize,
+    /// Points that the pose was computed from.
+    pub inliers: usize,
+    /// The pose.
+    pub world_from_object: Rigid3<World, Object>,
+    /// Root mean square residual length of the inliers, pixels.
+    pub rms_px: f64,
+    /// Residual length from which a click counts as wrong, pixels.
+    pub limit_px: f64,
+    /// Every clicked point in the file's order.
+    pub residuals: Vec<KeypointResidual>,
+    /// Covariance of the pose, left perturbation in the world frame, `[rotation; translation]` (rad, m), row-major,
+    /// scaled by the residuals' variance. It takes the phone's poses as exact: errors that all annotated frames share
+    /// are not in it.
+    pub covariance: [[f64; 6]; 6],
+    /// Standard deviation of the rotation, degrees.
+    pub rotation_std_deg: f64,
+    /// Standard deviation of the position of the points' centroid, millimetres.
+    pub translation_std_mm: f64,
+    /// Condition number of the scaled normal equations; above about 1e4 the points leave some motion nearly free.
+    pub condition: f64,
+    /// How the inliers' 3D points lie in space.
+    pub layout: PointLayout,
+    /// The file written.
+    pub written: PathBuf,
+    /// What deserves a look.
+    pub warnings: Vec<String>,
+}
+
+/// One clicked point after the fit.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct KeypointResidual {
+    /// Position in the file, from 0.
+    pub index: usize,
+    /// What the annotator called it.
+    pub name: String,
+    /// The frame.
+    pub frame: FrameId,
+    /// Clicked pixel.
+    pub pixel: Point2<f64>,
+    /// Where the model's point appears with the pose found; `None` behind the camera.
+    pub predicted: Option<Point2<f64>>,
+    /// Distance between the two, pixels; `None` behind the camera.
+    pub residual_px: Option<f64>,
+    /// Whether the pose was computed from it.
+    pub inlier: bool,
+}
+
+/// Computes the object's pose from `annotation/keypoints.json` and writes `alignment/alignment.json`.
+///
+/// The cameras' poses are taken from `pose/` and their relative poses as exact. Wrong clicks are left out and named in
+/// the warnings. Results of later stages that an earlier run left behind in `alignment/` are removed.
+///
+/// # Errors
+/// The file is missing, malformed, names a frame that is not there or a pixel outside the photograph, or its points
+/// determine no pose (too few, on one line, mirrored, ambiguous, contradictory); nothing is written then.
+pub fn align_keypoints(
+    sequence: &Sequence,
+    options: &KeypointOptions,
+    progress: &dyn Progress,
+) -> Result<KeypointSummary> {
+    let path = sequence.root().join(Keypoints::FILE);
+    if !path.exists() {
+        return Err(InputError::new(path, "the sequence has no clicked points")
+            .help("Click 10 to 20 points in `mobilebrick studio`, or write the file by hand (docs/formats.md)")
+            .into());
+    }
+    let steps = Steps::new(progress, "pose from keypoints", 1);
+    let keypoints = Keypoints::read(&path)?;
+    check(&path, &keypoints, sequence)?;
+
+    let mut ids: Vec<FrameId> = keypoints.keypoints.iter().map(|k| k.frame).collect();
+    ids.sort_unstable();
+    ids.dedup();
+    let cameras: Vec<PosedCamera> = ids
+        .iter()
+        .filter_map(|id| sequence.frame(*id))
+        .map(|f| PosedCamera { intrinsics: f.intrinsics, world_from_cam: f.world_from_cam })
+        .collect();
+    let correspondences: Vec<Correspondence> = keypoints
+        .keypoints
+        .iter()
+        .map(|k| Correspondence {
+            camera_idx: ids.partition_point(|id| *id < k.frame),
+            pixel: k.pixel,
+            point_in_object: k.point_in_object_m,
+        })
+        .collect();
+    let estimate = estimate_pose(&cameras, &correspondences, &options.pnp).map_err(|e| explain(&path, &e))?;
+
+    let written = begin_stage(sequence)?;
+    Alignment {
+        version: 1,
+        stage: AlignmentStage::Keypoints,
+        world_from_object: estimate.world_from_object,
+        object_covariance: Some(rows(&estimate.covariance)),
+        rms_px: Some(estimate.rms_px),
+        frames: Vec::new(),
+    }
+    .write(&written)?;
+    steps.step()?;
+    Ok(summary(&keypoints, &estimate, ids.len(), written))
+}
+
+/// Refuses what no annotator can have clicked.
+fn check(path: &Path, keypoints: &Keypoints, sequence: &Sequence) -> Result<()> {
+    if keypoints.version != 1 {
+        let found = format!("version {} of the keypoint file, this program reads version 1", keypoints.version);
+        return Err(Error::input(path, found));
+    }
+    let size = sequence.image_size();
+    for (i, k) in keypoints.keypoints.iter().enumerate() {
+        let wrong = |found: String, help: &str| -> Result<()> {
+            let place = format!("keypoint {i} (frame {})", k.frame);
+            Err(InputError::new(path, found).at(place).help(help).into())
+        };
+        if sequence.frame(k.frame).is_none() {
+            return wrong("the sequence has no such frame".to_owned(), "Remove the point or add the frame");
+        }
+        let inside = |v: f64, count: usize| v >= -0.5 && v <= count as f64 - 0.5;
+        if !(inside(k.pixel.x, size.width) && inside(k.pixel.y, size.height)) {
+            let found = format!("pixel ({}, {}) lies outside the photograph of {size}", k.pixel.x, k.pixel.y);
+            return wrong(found, "Pixels are (x, y) of the photograph in sensor orientation, as it lies in image/");
+        }
+        let far = k.point_in_object_m.coords.amax();
+        // No brick model is ten metres across; a nominal one in millimetres or LDraw units is.
+        if !far.is_finite() || far > 10.0 {
+            let found = format!("a coordinate of the 3D point is {far}");
+            return wrong(found, "point_in_object_m is in metres in the object's frame (1 LDraw unit = 0.0004 m)");
+        }
+    }
+    Ok(())
+}
+
+/// A pose failure as bad input, with what to do.
+fn explain(path: &Path, error: &PnpError) -> Error {
+    let help = match error {
+        PnpError::TooFew { .. } => "Click more points, best 10 to 20 over three or more frames",
+        PnpError::Collinear { .. } => "Click points off that line",
+        PnpError::Behind { .. } => {
+            "Check that pose/ holds camera-to-world matrices with OpenCV axes (z forward), and that the frames are right"
+        }
+        PnpError::Mirrored { .. } => {
+            "One axis of point_in_object_m has the wrong sign: the object frame is y up, LDraw's is -y up"
+        }
+        PnpError::Ambiguous { .. } => "Click points off the plane, or in a frame seen from another side",
+        PnpError::NoAgreement { .. } => {
+            "Check the scale (metres) and frame of point_in_object_m, the frame numbers, and that x comes before y in pixel"
+        }
+    };
+    InputError::new(path, error.to_string()).help(help).into()
+}
+
+fn rows(m: &Matrix6<f64>) -> [[f64; 6]; 6] {
+    std::array::from_fn(|row| std::array::from_fn(|col| m[(row, col)]))
+}
+
+fn summary(keypoints: &Keypoints, estimate: &PoseEstimate, frames: usize, written: PathBuf) -> KeypointSummary {
+    let residuals: Vec<KeypointResidual> = keypoints
+        .keypoints
+        .iter()
+        .enumerate()
+        .map(|(index, k)| {
+            let residual = estimate.residuals_px[index];
+            KeypointResidual {
+                index,
+                name: k.name.clone(),
+                frame: k.frame,
+                pixel: k.pixel,
+                predicted: residual.map(|r| k.pixel - r),
+                residual_px: residual.map(|r| r.norm()),
+                inlier: estimate.inliers[index],
+            }
+        })
+        .collect();
+    let points = residuals.len();
+    let inliers = residuals.iter().filter(|r| r.inlier).count();
+    let mut warnings: Vec<String> = residuals.iter().filter(|r| !r.inlier).map(|r| wrong_click(r, estimate)).collect();
+    match estimate.layout {
+        PointLayout::Solid => {}
+        PointLayout::NearlyCoplanar => warnings
+            .push("the 3D points are nearly coplanar: points off that plane would make the pose firmer".to_owned()),
+        PointLayout::Coplanar => {
+            warnings.push("the 3D points are coplanar: points off that plane would make the pose firmer".to_owned());
+        }
+    }
+    if points < 6 {
+        warnings.push(format!("{points} points are too few to find a wrong click; 6 or more are needed"));
+    }
+    let (rotation_std_deg, translation_std_mm) =
+        (estimate.rotation_std_rad.to_degrees(), estimate.centroid_std_m * 1e3);
+    if rotation_std_deg > 2.0 || translation_std_mm > 10.0 {
+        warnings.push(format!(
+            "the pose is uncertain by {rotation_std_deg:.1} deg and {translation_std_mm:.1} mm: add points in other frames"
+        ));
+    }
+    KeypointSummary {
+        points,
+        frames,
+        inliers,
+        world_from_object: estimate.world_from_object,
+        rms_px: estimate.rms_px,
+        limit_px: estimate.limit_px,
+        residuals,
+        covariance: rows(&estimate.covariance),
+        rotation_std_deg,
+        translation_std_mm,
+        condition: estimate.condition,
+        layout: estimate.layout,
+        written,
+        warnings,
+    }
+}
+
+fn wrong_click(r: &KeypointResidual, estimate: &PoseEstimate) -> String {
+    let name = if r.name.is_empty() { String::new() } else { format!(" '{}'", r.name) };
+    let why = match r.residual_px {
+        Some(px) => format!("is {px:.1} px from where the model has it (limit {:.1} px)", estimate.limit_px),
+        None => "lies behind the camera".to_owned(),
+    };
+    format!("keypoint {}{name} in frame {} {why}: a wrong click, left out", r.index, r.frame)
+}

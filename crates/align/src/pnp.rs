@@ -1,0 +1,597 @@
+//! The object's pose from clicked points: robust, over any number of posed cameras, with its uncertainty.
+
+use mb_geometry::{Camera, Intrinsics, Object, Rigid3, World};
+use mb_job::rng;
+use nalgebra::{Matrix2x3, Matrix2x6, Matrix3, Matrix6, Point2, Point3, Vector2, Vector3, Vector6};
+use rand::RngExt;
+use serde::{Deserialize, Serialize};
+
+use crate::sqpnp::{self, Sighting};
+
+/// A camera whose pose is taken as known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PosedCamera {
+    /// Intrinsics of the photograph.
+    pub intrinsics: Intrinsics,
+    /// Its pose.
+    pub world_from_cam: Rigid3<World, Camera>,
+}
+
+/// A point of the object and the pixel that shows it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Correspondence {
+    /// Index of the camera that shows it.
+    pub camera_idx: usize,
+    /// Pixel (x, y), pixel centres at integers.
+    pub pixel: Point2<f64>,
+    /// The point, metres, object frame.
+    pub point_in_object: Point3<f64>,
+}
+
+/// How [`estimate_pose`] works.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PnpOptions {
+    /// Standard deviation of a careful click along each image axis, pixels, above 0. Wrong clicks are told from right
+    /// ones by it, or by the spread of the residuals where that is larger (relative poses of a phone drift).
+    pub click_noise_px: f64,
+    /// Largest root mean square angle between right clicks and the model for which a pose is accepted, degrees. The
+    /// default is several times what a phone's drift causes.
+    pub max_rms_deg: f64,
+    /// Random subsets tried in the search for wrong clicks.
+    pub subsets: usize,
+    /// Seed of the subsets.
+    pub seed: u64,
+}
+
+impl Default for PnpOptions {
+    fn default() -> Self {
+        Self { click_noise_px: 2.0, max_rms_deg: 2.0, subsets: 300, seed: 0 }
+    }
+}
+
+/// How the object's points lie in space, which decides what a pose can be told from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PointLayout {
+    /// They span a volume.
+    Solid,
+    /// Their thickness is under 5 % of their length: the pose has a weak mirrored twin.
+    NearlyCoplanar,
+    /// They lie in a plane: from one camera the pose may have a mirrored twin that fits as well.
+    Coplanar,
+}
+
+/// Why there is no pose.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum PnpError {
+    /// Fewer than four points.
+    #[error("{found} keypoints, but a pose needs at least 4 (and 6 to find a wrong click)")]
+    TooFew {
+        /// How many there are.
+        found: usize,
+    },
+    /// The 3D points coincide or lie on a line, so the object can turn about it.
+    #[error("the 3D points lie on one line (spread across it {across_mm:.2} mm, along it {along_mm:.2} mm)")]
+    Collinear {
+        /// Root mean square distance along the line, millimetres.
+        along_mm: f64,
+        /// The same across the line.
+        across_mm: f64,
+    },
+    /// The best fit puts most points behind the cameras that show them.
+    #[error("the pose that fits best puts {behind} of {points} points behind the camera that shows them")]
+    Behind {
+        /// Points behind.
+        behind: usize,
+        /// Points in all.
+        points: usize,
+    },
+    /// The mirror image of the 3D points fits and the points do not.
+    #[error("the mirror image of the 3D points fits ({mirrored_px:.1} px), the points themselves do not ({px:.1} px)")]
+    Mirrored {
+        /// Median residual of the points.
+        px: f64,
+        /// Median residual of their mirror image.
+        mirrored_px: f64,
+    },
+    /// Two different poses fit equally well.
+    #[error(
+        "two poses that are {apart_deg:.1} deg apart fit equally well ({rms_px:.2} and {other_rms_px:.2} px), because \
+         the 3D points are (nearly) coplanar"
+    )]
+    Ambiguous {
+        /// Residual of the better pose.
+        rms_px: f64,
+        /// Residual of its twin.
+        other_rms_px: f64,
+        /// Angle between the two.
+        apart_deg: f64,
+    },
+    /// No pose fits most of the points.
+    #[error("no pose fits the keypoints: the best leaves {rms_px:.1} px over {agreeing} of {points} points")]
+    NoAgreement {
+        /// Residual over the points that agree best.
+        rms_px: f64,
+        /// How many these are.
+        agreeing: usize,
+        /// Points in all.
+        points: usize,
+    },
+}
+
+/// A pose with the evidence for it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PoseEstimate {
+    /// The pose.
+    pub world_from_object: Rigid3<World, Object>,
+    /// Covariance, left perturbation in the world frame, `[rotation; translation]` (rad, m), scaled by the residuals'
+    /// variance. It takes the cameras' poses as exact.
+    pub covariance: Matrix6<f64>,
+    /// Standard deviation of the rotation, radians: the root of the trace of its covariance.
+    pub rotation_std_rad: f64,
+    /// Standard deviation of the position of the points' centroid, metres.
+    pub centroid_std_m: f64,
+    /// Condition number of the normal equations after scaling each parameter to unit curvature, about the centroid.
+    pub condition: f64,
+    /// Per correspondence: found minus predicted pixel; `None` behind the camera.
+    pub residuals_px: Vec<Option<Vector2<f64>>>,
+    /// Per correspondence: whether the pose was computed from it.
+    pub inliers: Vec<bool>,
+    /// Residual length beyond which a click counts as wrong.
+    pub limit_px: f64,
+    /// Root mean square residual length of the inliers.
+    pub rms_px: f64,
+    /// How the inliers' 3D points lie.
+    pub layout: PointLayout,
+}
+
+/// Residuals of right clicks stay below this multiple of their standard deviation along an axis: the length is Rayleigh
+/// distributed, which exceeds it once in a thousand.
+const RAYLEIGH_LIMIT: f64 = 3.72;
+/// Median of a Rayleigh distribution of unit scale.
+const RAYLEIGH_MEDIAN: f64 = 1.177_410_022_515_474_7;
+/// Chance that two poses of which one is wrong differ by less than this in squared residuals over variance: 1 %.
+const TWIN_LIMIT: f64 = 6.63;
+
+/// Estimates the pose of the object.
+///
+/// Starts come from SQPnP on all points and on random subsets, judged by the median residual, so nearly half of the
+/// clicks may be wrong (from six points on). Each start is polished by Levenberg-Marquardt on squared pixel residuals
+/// over the clicks that agree with it, until that set no longer changes.
+///
+/// # Errors
+/// See [`PnpError`]: each kind of configuration that has no, or no unique, answer is told apart.
+///
+/// # Panics
+/// If a correspondence names a camera that is not there.
+pub fn estimate_pose(
+    cameras: &[PosedCamera],
+    correspondences: &[Correspondence],
+    options: &PnpOptions,
+) -> Result<PoseEstimate, PnpError> {
+    let problem = Problem::new(cameras, correspondences);
+    let points = correspondences.len();
+    if points < 4 {
+        return Err(PnpError::TooFew { found: points });
+    }
+    let all = vec![true; points];
+    layout(correspondences, &all)?;
+
+    let fit = problem.best_fit(options);
+    let Some(Fit { pose, inliers, limit_px }) = fit else {
+        let behind = problem.closest_to_rays(&all).map_or(points, |s| points - s.in_front);
+        return Err(PnpError::Behind { behind, points });
+    };
+    let residuals = problem.residuals(&pose);
+    let behind = residuals.iter().filter(|r| r.is_none()).count();
+    if 2 * behind > points {
+        return Err(PnpError::Behind { behind, points });
+    }
+    let rms_px = rms(&residuals, &inliers);
+    let agreeing = inliers.iter().filter(|&&i| i).count();
+
+    if rms_px > 1.5 * options.click_noise_px * std::f64::consts::SQRT_2 || 2 * agreeing <= points {
+        let mirrored: Vec<Correspondence> = correspondences
+            .iter()
+            .map(|c| Correspondence { point_in_object: mirrored(&c.point_in_object), ..*c })
+            .collect();
+        let twin = Problem::new(cameras, &mirrored);
+        if let Some(fit) = twin.best_fit(options) {
+            let (px, mirrored_px) = (median(&residuals), median(&twin.residuals(&fit.pose)));
+            if mirrored_px < 0.4 * px {
+                return Err(PnpError::Mirrored { px, mirrored_px });
+            }
+        }
+    }
+    if rms_px > problem.pixels_per_radian() * options.max_rms_deg.to_radians() || 2 * agreeing < points {
+        return Err(PnpError::NoAgreement { rms_px, agreeing, points });
+    }
+    let layout = layout(correspondences, &inliers)?;
+    // Two residuals a point against six parameters; four points leave two degrees of freedom.
+    let freedom = (2 * agreeing - 6) as f64;
+    let sum_sq = rms_px * rms_px * agreeing as f64;
+    let variance_px2 = (sum_sq / freedom).max(1e-12);
+    if let Some((other, other_sum_sq)) = problem.twin(&pose, &inliers)
+        && (other_sum_sq - sum_sq) / variance_px2.max((0.25 * options.click_noise_px).powi(2)) < TWIN_LIMIT
+    {
+        return Err(PnpError::Ambiguous {
+            rms_px,
+            other_rms_px: (other_sum_sq / agreeing as f64).sqrt(),
+            apart_deg: pose.rotation().angle_to(&other.rotation()).to_degrees(),
+        });
+    }
+
+    let normal = problem.normal_equations(&pose, &inliers).map(|n| n.hessian).unwrap_or_else(Matrix6::zeros);
+    let scale = normal.diagonal().map(|v| 1.0 / v.max(f64::MIN_POSITIVE).sqrt());
+    let scaled = Matrix6::from_diagonal(&scale) * normal * Matrix6::from_diagonal(&scale);
+    let eigenvalues = scaled.symmetric_eigenvalues();
+    let condition = eigenvalues.max() / eigenvalues.min().max(f64::MIN_POSITIVE);
+    let Some(inverse) = scaled.cholesky().map(|c| c.inverse()) else {
+        return Err(PnpError::NoAgreement { rms_px, agreeing, points });
+    };
+    let about_centroid = Matrix6::from_diagonal(&scale) * inverse * Matrix6::from_diagonal(&scale) * variance_px2;
+    let centroid = problem.centroid(&pose, &inliers);
+    Ok(PoseEstimate {
+        world_from_object: pose,
+        covariance: about_origin(&about_centroid, &centroid),
+        rotation_std_rad: about_centroid.fixed_view::<3, 3>(0, 0).trace().sqrt(),
+        centroid_std_m: about_centroid.fixed_view::<3, 3>(3, 3).trace().sqrt(),
+        condition,
+        residuals_px: residuals,
+        inliers,
+        limit_px,
+        rms_px,
+        layout,
+    })
+}
+
+/// How the chosen points lie in space.
+fn layout(correspondences: &[Correspondence], chosen: &[bool]) -> Result<PointLayout, PnpError> {
+    let points: Vec<Point3<f64>> =
+        correspondences.iter().zip(chosen).filter(|(_, chosen)| **chosen).map(|(c, _)| c.point_in_object).collect();
+    let n = points.len().max(1) as f64;
+    let mean = points.iter().map(|p| p.coords).sum::<Vector3<f64>>() / n;
+    let spread: Matrix3<f64> =
+        points.iter().map(|p| (p.coords - mean) * (p.coords - mean).transpose()).sum::<Matrix3<f64>>() / n;
+    let mut lengths: [f64; 3] = spread.symmetric_eigenvalues().map(|v| v.max(0.0).sqrt()).into();
+    lengths.sort_by(|a, b| b.total_cmp(a));
+    let [along, across, thickness] = lengths;
+    // A click of 1 px turns a strip that is 1 % as wide as long by far more than a pose may be off.
+    if across <= 0.01 * along || along == 0.0 {
+        Err(PnpError::Collinear { along_mm: along * 1e3, across_mm: across * 1e3 })
+    } else if thickness <= 1e-4 * along {
+        Ok(PointLayout::Coplanar)
+    } else if thickness <= 0.05 * along {
+        Ok(PointLayout::NearlyCoplanar)
+    } else {
+        Ok(PointLayout::Solid)
+    }
+}
+
+fn mirrored(p: &Point3<f64>) -> Point3<f64> {
+    Point3::new(-p.x, p.y, p.z)
+}
+
+/// Covariance of a left perturbation about the world's origin from that of one about `centroid`: a rotation `w` about
+/// the centroid `c` with a shift `v` is the same motion as a rotation `w` about the origin with the shift `v + c x w`.
+fn about_origin(about_centroid: &Matrix6<f64>, centroid: &Vector3<f64>) -> Matrix6<f64> {
+    let mut map = Matrix6::identity();
+    map.fixed_view_mut::<3, 3>(3, 0).copy_from(&centroid.cross_matrix());
+    let covariance = map * about_centroid * map.transpose();
+    (covariance + covariance.transpose()) * 0.5
+}
+
+fn median(residuals: &[Option<Vector2<f64>>]) -> f64 {
+    let mut lengths: Vec<f64> = residuals.iter().map(|r| r.map_or(f64::INFINITY, |r| r.norm())).collect();
+    lengths.sort_by(f64::total_cmp);
+    lengths[lengths.len() / 2]
+}
+
+fn rms(residuals: &[Option<Vector2<f64>>], chosen: &[bool]) -> f64 {
+    let mut sum = 0.0;
+    let mut n = 0.0;
+    for r in residuals.iter().zip(chosen).filter(|(_, chosen)| **chosen).filter_map(|(r, _)| *r) {
+        sum += r.norm_squared();
+        n += 1.0;
+    }
+    if n > 0.0 { f64::sqrt(sum / n) } else { f64::INFINITY }
+}
+
+/// A pose and the correspondences that agree with it.
+struct Fit {
+    pose: Rigid3<World, Object>,
+    inliers: Vec<bool>,
+    limit_px: f64,
+}
+
+/// Gauss-Newton's equations for a rotation about the centroid and a shift.
+struct NormalEquations {
+    hessian: Matrix6<f64>,
+    /// `J' r`, with `r` found minus predicted.
+    right: Vector6<f64>,
+    sum_sq: f64,
+}
+
+struct Problem<'a> {
+    cameras: &'a [PosedCamera],
+    cam_from_world: Vec<(Matrix3<f64>, Vector3<f64>)>,
+    correspondences: &'a [Correspondence],
+    sightings: Vec<Sighting>,
+}
+
+impl<'a> Problem<'a> {
+    fn new(cameras: &'a [PosedCamera], correspondences: &'a [Correspondence]) -> Self {
+        let cam_from_world = cameras
+            .iter()
+            .map(|c| c.world_from_cam.inverse())
+            .map(|t| (t.rotation_matrix(), t.translation()))
+            .collect();
+        let sightings = correspondences
+            .iter()
+            .map(|c| {
+                let camera = &cameras[c.camera_idx];
+                let ray = camera.intrinsics.ray(&c.pixel, &camera.world_from_cam);
+                Sighting {
+                    origin_in_world: ray.origin,
+                    direction_in_world: ray.direction,
+                    point_in_object: c.point_in_object,
+                }
+            })
+            .collect();
+        Self { cameras, cam_from_world, correspondences, sightings }
+    }
+
+    /// Mean focal length over the correspondences.
+    fn pixels_per_radian(&self) -> f64 {
+        let sum: f64 = self.correspondences.iter().map(|c| self.cameras[c.camera_idx].intrinsics.fx).sum();
+        sum / self.correspondences.len() as f64
+    }
+
+    fn centroid(&self, pose: &Rigid3<World, Object>, chosen: &[bool]) -> Vector3<f64> {
+        let (mut sum, mut n) = (Vector3::zeros(), 0.0);
+        for (c, _) in self.correspondences.iter().zip(chosen).filter(|(_, chosen)| **chosen) {
+            sum += (*pose * c.point_in_object).coords;
+            n += 1.0;
+        }
+        if n > 0.0 { sum / n } else { sum }
+    }
+
+    fn residuals(&self, pose: &Rigid3<World, Object>) -> Vec<Option<Vector2<f64>>> {
+        let (rotation, translation) = (pose.rotation_matrix(), pose.translation());
+        self.correspondences
+            .iter()
+            .map(|c| {
+                let p_in_world = rotation * c.point_in_object.coords + translation;
+                let (r, t) = &self.cam_from_world[c.camera_idx];
+                let predicted = self.cameras[c.camera_idx].intrinsics.img_from_cam(&Point3::from(r * p_in_world + t));
+                predicted.map(|predicted| c.pixel - predicted)
+            })
+            .collect()
+    }
+
+    /// `None` where a chosen point lies behind its camera.
+    fn normal_equations(&self, pose: &Rigid3<World, Object>, chosen: &[bool]) -> Option<NormalEquations> {
+        let center = self.centroid(pose, chosen);
+        let (rotation, translation) = (pose.rotation_matrix(), pose.translation());
+        let mut sums = NormalEquations { hessian: Matrix6::zeros(), right: Vector6::zeros(), sum_sq: 0.0 };
+        for (c, _) in self.correspondences.iter().zip(chosen).filter(|(_, chosen)| **chosen) {
+            let p_in_world = rotation * c.point_in_object.coords + translation;
+            let (r, t) = &self.cam_from_world[c.camera_idx];
+            let k = &self.cameras[c.camera_idx].intrinsics;
+            let (predicted, jacobian) = project(k, r, t, &p_in_world, &center)?;
+            let residual = c.pixel - predicted;
+            sums.hessian += jacobian.transpose() * jacobian;
+            sums.right += jacobian.transpose() * residual;
+            sums.sum_sq += residual.norm_squared();
+        }
+        Some(sums)
+    }
+
+    /// Levenberg-Marquardt over the chosen correspondences. `None` where the start already has one behind its camera.
+    fn polish(&self, start: &Rigid3<World, Object>, chosen: &[bool]) -> Option<(Rigid3<World, Object>, f64)> {
+        let mut pose = *start;
+        let mut equations = self.normal_equations(&pose, chosen)?;
+        let mut damping = 1e-6;
+        for _ in 0..50 {
+            let mut damped = equations.hessian;
+            for i in 0..6 {
+                damped[(i, i)] *= 1.0 + damping;
+            }
+            let Some(cholesky) = damped.cholesky() else {
+                damping *= 10.0;
+                continue;
+            };
+            let step = cholesky.solve(&equations.right);
+            let next = moved(&pose, &step, &self.centroid(&pose, chosen));
+            match self.normal_equations(&next, chosen) {
+                Some(better) if better.sum_sq <= equations.sum_sq => {
+                    let gain = equations.sum_sq - better.sum_sq;
+                    (pose, equations) = (next, better);
+                    damping = (damping * 0.1).max(1e-9);
+                    if gain <= 1e-12 * equations.sum_sq || equations.sum_sq < 1e-18 {
+                        break;
+                    }
+                }
+                _ => damping *= 10.0,
+            }
+            if damping > 1e9 {
+                break;
+            }
+        }
+        Some((pose, equations.sum_sq))
+    }
+
+    fn chosen_sightings(&self, chosen: &[bool]) -> Vec<Sighting> {
+        self.sightings.iter().zip(chosen).filter(|(_, chosen)| **chosen).map(|(s, _)| *s).collect()
+    }
+
+    /// The pose that brings points and rays, taken as full lines, closest.
+    fn closest_to_rays(&self, chosen: &[bool]) -> Option<sqpnp::Solution> {
+        let solutions = sqpnp::solve(&self.chosen_sightings(chosen));
+        solutions.into_iter().min_by(|a, b| a.cost_m2.total_cmp(&b.cost_m2))
+    }
+
+    /// The best local minimum over the chosen correspondences with all of them in front.
+    fn polished_minimum(&self, chosen: &[bool]) -> Option<(Rigid3<World, Object>, f64)> {
+        let count = chosen.iter().filter(|&&c| c).count();
+        sqpnp::solve(&self.chosen_sightings(chosen))
+            .iter()
+            .filter(|s| s.in_front == count)
+            .take(3)
+            .filter_map(|s| self.polish(&s.world_from_object, chosen))
+            .min_by(|a, b| a.1.total_cmp(&b.1))
+    }
+
+    fn best_fit(&self, options: &PnpOptions) -> Option<Fit> {
+        let points = self.correspondences.len();
+        let all = vec![true; points];
+        let noise_limit = RAYLEIGH_LIMIT * options.click_noise_px;
+        let whole = self.polished_minimum(&all).map(|(pose, _)| pose);
+        if let Some(pose) = whole {
+            let residuals = self.residuals(&pose);
+            let largest = residuals.iter().map(|r| r.map_or(f64::INFINITY, |r| r.norm())).fold(0.0, f64::max);
+            // With five points or fewer, leaving one out always leaves an exact or nearly exact fit.
+            if largest <= noise_limit || points < 6 {
+                let limit_px = noise_limit.max(largest);
+                return Some(Fit { pose, inliers: all, limit_px });
+            }
+        }
+        if points < 6 {
+            return None;
+        }
+
+        // Least median of squares (Rousseeuw 1984) over random subsets.
+        let mut best = whole.map(|pose| (pose, median(&self.residuals(&pose))));
+        let subset_size = if points < 10 { 4 } else { 5 };
+        let mut rng = rng(options.seed, 0);
+        let mut order: Vec<usize> = (0..points).collect();
+        for _ in 0..options.subsets {
+            for i in 0..subset_size {
+                let j = rng.random_range(i..points);
+                order.swap(i, j);
+            }
+            let subset: Vec<Sighting> = order[..subset_size].iter().map(|&i| self.sightings[i]).collect();
+            for solution in sqpnp::solve(&subset).iter().filter(|s| s.in_front == subset_size) {
+                let mut pose = solution.world_from_object;
+                let mut score = median(&self.residuals(&pose));
+                // The half that agrees best gives a better pose than the subset; only promising ones are worth it.
+                if best.is_none_or(|(_, best)| score < 2.0 * best) {
+                    let half = self.within(&pose, score);
+                    if let Some((polished, _)) = self.polish(&pose, &half) {
+                        let polished_score = median(&self.residuals(&polished));
+                        if polished_score < score {
+                            (pose, score) = (polished, polished_score);
+                        }
+                    }
+                }
+                if best.is_none_or(|(_, best)| score < best) {
+                    best = Some((pose, score));
+                }
+            }
+        }
+        let (mut pose, score) = best.filter(|(_, score)| score.is_finite())?;
+
+        // Small samples make the median too small (Rousseeuw and Leroy 1987, p. 202).
+        let small_sample = 1.0 + 5.0 / (points as f64 - 5.0);
+        let mut sigma = (score / RAYLEIGH_MEDIAN * small_sample).max(options.click_noise_px);
+        let mut inliers = self.within(&pose, RAYLEIGH_LIMIT * sigma);
+        for _ in 0..20 {
+            let (polished, sum_sq) = self.polish(&pose, &inliers)?;
+            pose = polished;
+            let agreeing = inliers.iter().filter(|&&i| i).count();
+            sigma = (sum_sq / (2.0 * agreeing as f64 - 6.0).max(1.0)).sqrt().max(options.click_noise_px);
+            let next = self.within(&pose, RAYLEIGH_LIMIT * sigma);
+            if next == inliers || next.iter().filter(|&&i| i).count() < 4 {
+                break;
+            }
+            inliers = next;
+        }
+        Some(Fit { pose, inliers, limit_px: RAYLEIGH_LIMIT * sigma })
+    }
+
+    /// Which correspondences have a residual of at most `limit_px`.
+    fn within(&self, pose: &Rigid3<World, Object>, limit_px: f64) -> Vec<bool> {
+        self.residuals(pose).iter().map(|r| r.is_some_and(|r| r.norm() <= limit_px)).collect()
+    }
+
+    /// The best local minimum other than `pose`, with the sum of its squared residuals.
+    fn twin(&self, pose: &Rigid3<World, Object>, chosen: &[bool]) -> Option<(Rigid3<World, Object>, f64)> {
+        let count = chosen.iter().filter(|&&c| c).count();
+        let centroid = Point3::from(self.centroid(pose, chosen));
+        // A plane seen from afar looks the same when it is turned about the line of sight's perpendicular: try the
+        // reflection of its normal at the line of sight, besides what SQPnP met.
+        let normal = self.thinnest_direction(pose, chosen);
+        let mut starts: Vec<Rigid3<World, Object>> = sqpnp::solve(&self.chosen_sightings(chosen))
+            .iter()
+            .filter(|s| s.in_front == count)
+            .map(|s| s.world_from_object)
+            .collect();
+        for camera in self.cameras {
+            let sight = (centroid.coords - camera.world_from_cam.translation()).normalize();
+            let reflected = sight * (2.0 * sight.dot(&normal)) - normal;
+            if let Some(turn) = nalgebra::Rotation3::rotation_between(&normal, &reflected) {
+                let turn = nalgebra::UnitQuaternion::from_rotation_matrix(&turn);
+                let about = Rigid3::<World, World>::from_parts(turn, centroid.coords - turn * centroid.coords);
+                starts.push(about * *pose);
+            }
+        }
+        starts
+            .iter()
+            .filter_map(|start| self.polish(start, chosen))
+            .filter(|(other, _)| pose.rotation().angle_to(&other.rotation()) > 0.5_f64.to_radians())
+            .min_by(|a, b| a.1.total_cmp(&b.1))
+    }
+
+    /// The direction in the world in which the chosen points spread least.
+    fn thinnest_direction(&self, pose: &Rigid3<World, Object>, chosen: &[bool]) -> Vector3<f64> {
+        let center = self.centroid(pose, chosen);
+        let mut spread = Matrix3::zeros();
+        for (c, _) in self.correspondences.iter().zip(chosen).filter(|(_, chosen)| **chosen) {
+            let d = (*pose * c.point_in_object).coords - center;
+            spread += d * d.transpose();
+        }
+        let eigen = spread.symmetric_eigen();
+        eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned()
+    }
+}
+
+/// The pose after a rotation `step[0..3]` about `center` and a shift `step[3..6]`, in the world.
+fn moved(pose: &Rigid3<World, Object>, step: &Vector6<f64>, center: &Vector3<f64>) -> Rigid3<World, Object> {
+    let turn = nalgebra::UnitQuaternion::from_scaled_axis(step.fixed_rows::<3>(0).into_owned());
+    let shift = step.fixed_rows::<3>(3) + center - turn * center;
+    let mut rotation = turn * pose.rotation();
+    rotation.renormalize();
+    Rigid3::from_parts(rotation, turn * pose.translation() + shift)
+}
+
+/// The pixel of a point, and its derivative with respect to a rotation about `center` and a shift of the point in the
+/// world. `None` behind the camera.
+fn project(
+    k: &Intrinsics,
+    rotation: &Matrix3<f64>,
+    translation: &Vector3<f64>,
+    p_in_world: &Vector3<f64>,
+    center: &Vector3<f64>,
+) -> Option<(Point2<f64>, Matrix2x6<f64>)> {
+    let p = rotation * p_in_world + translation;
+    let pixel = k.img_from_cam(&Point3::from(p))?;
+    let inverse_z = 1.0 / p.z;
+    let pixel_of_cam = Matrix2x3::new(
+        k.fx * inverse_z,
+        0.0,
+        -k.fx * p.x * inverse_z * inverse_z,
+        0.0,
+        k.fy * inverse_z,
+        -k.fy * p.y * inverse_z * inverse_z,
+    );
+    let pixel_of_world = pixel_of_cam * rotation;
+    let mut jacobian = Matrix2x6::zeros();
+    jacobian.fixed_view_mut::<2, 3>(0, 0).copy_from(&(-pixel_of_world * (p_in_world - center).cross_matrix()));
+    jacobian.fixed_view_mut::<2, 3>(0, 3).copy_from(&pixel_of_world);
+    Some((pixel, jacobian))
+}
+
+#[cfg(test)]
+#[path = "pnp_tests.rs"]
+mod tests;
