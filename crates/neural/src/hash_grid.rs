@@ -1,0 +1,479 @@
+//! The multi-resolution hash encoding (Mueller et al. 2022, "Instant Neural Graphics Primitives").
+//!
+//! Level l is a grid of `N_l = floor(N_min * b^l)` cells a side over the unit cube. A corner with integer coordinates
+//! (i, j, k) owns `F` features at `(i * 1) ^ (j * 2654435761) ^ (k * 805459861) mod T`, or at its own index where the
+//! whole level fits into T entries. A level's value is trilinear in the corners: with cell coordinates t in 0..1,
+//!
+//! `e_f(x) = sum_c w_c(t) theta_cf`, `w_c = prod_d (c_d ? t_d : 1 - t_d)`.
+//!
+//! The gradient of `s = g . e(x)` for given g is `n_d = N_l sum_c (dw_c/dt_d) (g . theta_c)`. A loss that uses both e
+//! and n sends back, per corner,
+//!
+//! `dtheta_c = w_c de + (sum_d N_l dw_c/dt_d dn_d) g`, `dg = sum_c (sum_d N_l dw_c/dt_d dn_d) theta_c`,
+//!
+//! which is what an exact eikonal or colour loss on normals needs: [`HashGrid::tangent`] computes dg, and
+//! [`HashGrid::scatter`] dtheta. The scatter runs level by level, samples in their order, so that the sums do not
+//! depend on the thread count and no atomics are needed.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// Sizes of the encoding.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HashGridOptions {
+    /// Number of levels.
+    pub levels: usize,
+    /// Features of a level: 1, 2, 4 or 8.
+    pub features: usize,
+    /// Base-2 logarithm of the largest number of entries of a level.
+    pub log2_entries: u32,
+    /// Cells a side of the coarsest level.
+    pub coarsest: usize,
+    /// Cells a side of the finest level.
+    pub finest: usize,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Level {
+    cells: u32,
+    /// Offset of the first feature.
+    offset: usize,
+    entries: u32,
+    dense: bool,
+}
+
+/// The levels of an encoding, worked out.
+#[derive(Debug, Clone)]
+pub struct HashGrid {
+    options: HashGridOptions,
+    levels: Vec<Level>,
+    len: usize,
+}
+
+/// What a batch sends back to the table; see [`HashGrid::scatter`].
+#[derive(Debug, Clone, Copy)]
+pub struct Scatter<'a> {
+    /// Positions in the unit cube.
+    pub positions: &'a [[f32; 3]],
+    /// `[samples, stride]`: derivative with respect to the features, from column `first`.
+    pub d_features: &'a [f32],
+    /// Where a loss uses the gradient n: g, laid out like `d_features`, and dn.
+    pub gradient: Option<(&'a [f32], &'a [[f32; 3]])>,
+    /// Row length.
+    pub stride: usize,
+    /// First column of the encoding.
+    pub first: usize,
+}
+
+/// The eight corners of a cell: table index, and where it lies between them.
+struct Cell {
+    corners: [u32; 8],
+    t: [f32; 3],
+}
+
+impl Cell {
+    #[inline(always)]
+    fn weight(&self, corner: usize) -> f32 {
+        let pick = |d: usize| if corner >> d & 1 == 1 { self.t[d] } else { 1.0 - self.t[d] };
+        pick(0) * pick(1) * pick(2)
+    }
+
+    /// `sum_d dw/dt_d v_d`.
+    #[inline(always)]
+    fn weight_tangent(&self, corner: usize, v: [f32; 3]) -> f32 {
+        let [dx, dy, dz] = self.weight_gradient(corner);
+        dx * v[0] + dy * v[1] + dz * v[2]
+    }
+
+    #[inline(always)]
+    fn weight_gradient(&self, corner: usize) -> [f32; 3] {
+        let pick = |d: usize| if corner >> d & 1 == 1 { self.t[d] } else { 1.0 - self.t[d] };
+        let sign = |d: usize| if corner >> d & 1 == 1 { 1.0 } else { -1.0 };
+        let (x, y, z) = (pick(0), pick(1), pick(2));
+        [sign(0) * y * z, sign(1) * x * z, sign(2) * x * y]
+    }
+}
+
+impl Level {
+    #[inline(always)]
+    fn cell(&self, p: [f32; 3]) -> Cell {
+        let cells = self.cells as f32;
+        let mut base = [0u32; 3];
+        let mut t = [0.0; 3];
+        for d in 0..3 {
+            let at = (p[d] * cells).clamp(0.0, cells);
+            let floor = (at as u32).min(self.cells - 1);
+            base[d] = floor;
+            t[d] = at - floor as f32;
+        }
+        let corners = if self.dense {
+            let side = self.cells + 1;
+            let first = (base[2] * side + base[1]) * side + base[0];
+            std::array::from_fn(|c| {
+                first + (c as u32 & 1) + (c as u32 >> 1 & 1) * side + (c as u32 >> 2) * side * side
+            })
+        } else {
+            let mask = self.entries - 1;
+            let x = [base[0], base[0] + 1];
+            let y = [base[1].wrapping_mul(2_654_435_761), (base[1] + 1).wrapping_mul(2_654_435_761)];
+            let z = [base[2].wrapping_mul(805_459_861), (base[2] + 1).wrapping_mul(805_459_861)];
+            std::array::from_fn(|c| (x[c & 1] ^ y[c >> 1 & 1] ^ z[c >> 2]) & mask)
+        };
+        Cell { corners, t }
+    }
+}
+
+/// Runs `$body` with the constant `F` equal to the number of features.
+macro_rules! with_features {
+    ($self:ident, $function:ident ( $($arg:expr),* )) => {
+        match $self.options.features {
+            1 => $self.$function::<1>($($arg),*),
+            2 => $self.$function::<2>($($arg),*),
+            4 => $self.$function::<4>($($arg),*),
+            _ => $self.$function::<8>($($arg),*),
+        }
+    };
+}
+
+#[inline(always)]
+fn entry<const F: usize>(table: &[f32], level: &Level, corner: u32) -> [f32; F] {
+    let at = level.offset + corner as usize * F;
+    let mut out = [0.0; F];
+    out.copy_from_slice(&table[at..at + F]);
+    out
+}
+
+impl HashGrid {
+    /// Works out the levels.
+    ///
+    /// # Panics
+    /// A size is zero or beyond sense: features other than 1, 2, 4, 8; more than 2^28 entries; cells not rising.
+    pub fn new(options: HashGridOptions) -> Self {
+        assert!(matches!(options.features, 1 | 2 | 4 | 8) && options.levels > 0, "{options:?}");
+        assert!(options.log2_entries <= 28 && 0 < options.coarsest && options.coarsest <= options.finest, "{options:?}");
+        let growth = if options.levels > 1 {
+            (options.finest as f64 / options.coarsest as f64).powf(1.0 / (options.levels - 1) as f64)
+        } else {
+            1.0
+        };
+        let mut len = 0;
+        let levels = (0..options.levels)
+            .map(|l| {
+                let cells = (options.coarsest as f64 * growth.powi(l as i32) + 1e-6).floor();
+                let corners = (cells + 1.0).powi(3);
+                let largest = 1u32 << options.log2_entries;
+                let dense = corners <= f64::from(largest);
+                let entries = if dense { corners as u32 } else { largest };
+                let level = Level { cells: cells as u32, offset: len, entries, dense };
+                len += entries as usize * options.features;
+                level
+            })
+            .collect();
+        Self { options, levels, len }
+    }
+
+    /// Length of the table: all features of all levels.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Never: a grid has at least one level.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Features of all levels together.
+    pub fn width(&self) -> usize {
+        self.options.levels * self.options.features
+    }
+
+    /// Number of levels.
+    pub fn levels(&self) -> usize {
+        self.options.levels
+    }
+
+    /// Cells a side of `level`.
+    pub fn cells(&self, level: usize) -> usize {
+        self.levels[level].cells as usize
+    }
+
+    /// A table of small random features, uniform in +-1e-4 as in the original.
+    pub fn init(&self, rng: &mut mb_job::Rng) -> Vec<f32> {
+        use rand::RngExt;
+        (0..self.len).map(|_| rng.random_range(-1e-4..1e-4)).collect()
+    }
+
+    /// Writes the features of `positions` to `out`: `[samples, stride]`, from column `first`. Levels from `active` on
+    /// give zeros.
+    pub fn forward(&self, table: &[f32], positions: &[[f32; 3]], active: usize, out: &mut [f32], stride: usize, first: usize) {
+        with_features!(self, forward_f(table, positions, active, out, stride, first));
+    }
+
+    fn forward_f<const F: usize>(
+        &self,
+        table: &[f32],
+        positions: &[[f32; 3]],
+        active: usize,
+        out: &mut [f32],
+        stride: usize,
+        first: usize,
+    ) {
+        for (l, level) in self.levels.iter().enumerate() {
+            for (p, row) in positions.iter().zip(out.chunks_exact_mut(stride)) {
+                let mut sum = [0.0; F];
+                if l < active {
+                    let cell = level.cell(*p);
+                    for c in 0..8 {
+                        let w = cell.weight(c);
+                        let theta = entry::<F>(table, level, cell.corners[c]);
+                        for f in 0..F {
+                            sum[f] += w * theta[f];
+                        }
+                    }
+                }
+                row[first + l * F..first + (l + 1) * F].copy_from_slice(&sum);
+            }
+        }
+    }
+
+    /// Adds the gradient with respect to position of `g . e(x)` to `normals`; `g` is laid out like the features.
+    pub fn input_gradient(
+        &self,
+        table: &[f32],
+        positions: &[[f32; 3]],
+        active: usize,
+        g: &[f32],
+        stride: usize,
+        first: usize,
+        normals: &mut [[f32; 3]],
+    ) {
+        with_features!(self, input_gradient_f(table, positions, active, g, stride, first, normals));
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn input_gradient_f<const F: usize>(
+        &self,
+        table: &[f32],
+        positions: &[[f32; 3]],
+        active: usize,
+        g: &[f32],
+        stride: usize,
+        first: usize,
+        normals: &mut [[f32; 3]],
+    ) {
+        for (l, level) in self.levels.iter().enumerate().take(active) {
+            let scale = level.cells as f32;
+            for ((p, row), n) in positions.iter().zip(g.chunks_exact(stride)).zip(normals.iter_mut()) {
+                let cell = level.cell(*p);
+                let g = &row[first + l * F..first + (l + 1) * F];
+                let mut sum = [0.0; 3];
+                for c in 0..8 {
+                    let theta = entry::<F>(table, level, cell.corners[c]);
+                    let dot: f32 = (0..F).map(|f| g[f] * theta[f]).sum();
+                    let dw = cell.weight_gradient(c);
+                    for d in 0..3 {
+                        sum[d] += dw[d] * dot;
+                    }
+                }
+                for d in 0..3 {
+                    n[d] += scale * sum[d];
+                }
+            }
+        }
+    }
+
+    /// Writes dg, the derivative with respect to g of a loss whose derivative with respect to the gradient n is `d_n`,
+    /// to `d_g`, laid out like the features. Inactive levels give zeros.
+    #[allow(clippy::too_many_arguments)]
+    pub fn tangent(
+        &self,
+        table: &[f32],
+        positions: &[[f32; 3]],
+        active: usize,
+        d_n: &[[f32; 3]],
+        d_g: &mut [f32],
+        stride: usize,
+        first: usize,
+    ) {
+        with_features!(self, tangent_f(table, positions, active, d_n, d_g, stride, first));
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn tangent_f<const F: usize>(
+        &self,
+        table: &[f32],
+        positions: &[[f32; 3]],
+        active: usize,
+        d_n: &[[f32; 3]],
+        d_g: &mut [f32],
+        stride: usize,
+        first: usize,
+    ) {
+        for (l, level) in self.levels.iter().enumerate() {
+            let scale = level.cells as f32;
+            for ((p, row), n) in positions.iter().zip(d_g.chunks_exact_mut(stride)).zip(d_n) {
+                let mut sum = [0.0; F];
+                if l < active {
+                    let cell = level.cell(*p);
+                    for c in 0..8 {
+                        let w = scale * cell.weight_tangent(c, *n);
+                        let theta = entry::<F>(table, level, cell.corners[c]);
+                        for f in 0..F {
+                            sum[f] += w * theta[f];
+                        }
+                    }
+                }
+                row[first + l * F..first + (l + 1) * F].copy_from_slice(&sum);
+            }
+        }
+    }
+
+    /// Adds what the batches send back to `grads`, laid out like the table. Levels run in parallel; inside a level the
+    /// batches and their samples are added in order.
+    pub fn scatter(&self, batches: &[Scatter<'_>], active: usize, grads: &mut [f32]) {
+        let mut parts = Vec::with_capacity(self.levels.len());
+        let mut rest = grads;
+        for level in &self.levels {
+            let (part, tail) = rest.split_at_mut(level.entries as usize * self.options.features);
+            parts.push(part);
+            rest = tail;
+        }
+        parts.into_par_iter().enumerate().take(active).for_each(|(l, part)| {
+            for batch in batches {
+                with_features!(self, scatter_level(l, batch, part));
+            }
+        });
+    }
+
+    fn scatter_level<const F: usize>(&self, l: usize, batch: &Scatter<'_>, grads: &mut [f32]) {
+        let level = &self.levels[l];
+        let scale = level.cells as f32;
+        let columns = batch.first + l * F..batch.first + (l + 1) * F;
+        for (s, p) in batch.positions.iter().enumerate() {
+            let row = s * batch.stride;
+            let d_e: &[f32] = &batch.d_features[row + columns.start..row + columns.end];
+            let cell = level.cell(*p);
+            match batch.gradient {
+                None => {
+                    if d_e.iter().all(|v| *v == 0.0) {
+                        continue;
+                    }
+                    for c in 0..8 {
+                        let w = cell.weight(c);
+                        let at = cell.corners[c] as usize * F;
+                        for (to, d) in grads[at..at + F].iter_mut().zip(d_e) {
+                            *to += w * d;
+                        }
+                    }
+                }
+                Some((g, d_n)) => {
+                    let g = &g[row + columns.start..row + columns.end];
+                    for c in 0..8 {
+                        let w = cell.weight(c);
+                        let tangent = scale * cell.weight_tangent(c, d_n[s]);
+                        let at = cell.corners[c] as usize * F;
+                        for ((to, d), g) in grads[at..at + F].iter_mut().zip(d_e).zip(g) {
+                            *to += w * d + tangent * g;
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::RngExt;
+
+    fn grid(features: usize) -> HashGrid {
+        HashGrid::new(HashGridOptions { levels: 3, features, log2_entries: 7, coarsest: 3, finest: 11 })
+    }
+
+    /// Positions away from cell walls, where the encoding has a kink.
+    fn positions(rng: &mut mb_job::Rng) -> Vec<[f32; 3]> {
+        let away = |p: &[f32; 3]| {
+            (0..3).all(|l| p.iter().all(|v| ((v * grid(2).cells(l) as f32).fract() - 0.5).abs() < 0.45))
+        };
+        std::iter::repeat_with(|| std::array::from_fn(|_| rng.random_range(0.0..1.0f32))).filter(away).take(9).collect()
+    }
+
+    /// `sum_s d_e . e(x) + d_n . n(x)`, with n by finite differences of the encoding.
+    fn loss(grid: &HashGrid, table: &[f32], x: &[[f32; 3]], g: &[f32], d_e: &[f32], d_n: &[[f32; 3]]) -> f64 {
+        let width = grid.width();
+        let dot = |x: &[f32; 3], with: &[f32]| {
+            let mut e = vec![0.0; width];
+            grid.forward(table, &[*x], 3, &mut e, width, 0);
+            e.iter().zip(with).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>()
+        };
+        x.iter().enumerate().map(|(s, x)| {
+            let rows = s * width..(s + 1) * width;
+            let mut sum = dot(x, &d_e[rows.clone()]);
+            for d in 0..3 {
+                let at = |h: f32| { let mut y = *x; y[d] += h; dot(&y, &g[rows.clone()]) };
+                sum += f64::from(d_n[s][d]) * (at(2e-3) - at(-2e-3)) / 4e-3;
+            }
+            sum
+        }).sum()
+    }
+
+    #[test]
+    fn derivatives_of_both_orders_agree_with_finite_differences() {
+        for features in [1, 2, 4, 8] {
+            let grid = grid(features);
+            let width = grid.width();
+            let mut rng = mb_job::rng(features as u64, 0);
+            let x = positions(&mut rng);
+            let mut numbers = |n: usize| (0..n).map(|_| rng.random_range(-1.0..1.0f32)).collect::<Vec<_>>();
+            let (table, g, d_e) = (numbers(grid.len()), numbers(9 * width), numbers(9 * width));
+            let d_n: Vec<[f32; 3]> = numbers(27).chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect();
+
+            let mut normals = vec![[0.0; 3]; 9];
+            grid.input_gradient(&table, &x, 3, &g, width, 0, &mut normals);
+            let mut grads = vec![0.0; grid.len()];
+            let batch =
+                Scatter { positions: &x, d_features: &d_e, gradient: Some((&g, &d_n)), stride: width, first: 0 };
+            grid.scatter(&[batch], 3, &mut grads);
+            let mut d_g = vec![0.0; 9 * width];
+            grid.tangent(&table, &x, 3, &d_n, &mut d_g, width, 0);
+
+            let zero = vec![0.0; 9 * width];
+            for (s, n) in normals.iter().enumerate() {
+                for d in 0..3 {
+                    let mut unit = vec![[0.0; 3]; 9];
+                    unit[s][d] = 1.0;
+                    let expected = loss(&grid, &table, &x, &g, &zero, &unit);
+                    assert!((f64::from(n[d]) - expected).abs() < 2e-3, "normal {} is not {expected}", n[d]);
+                }
+            }
+            // The loss is linear in the table and in g, so any step is exact.
+            for i in (0..grid.len()).step_by(5) {
+                let at = |h: f32| { let mut t = table.clone(); t[i] += h; loss(&grid, &t, &x, &g, &d_e, &d_n) };
+                let expected = at(0.5) - at(-0.5);
+                assert!((f64::from(grads[i]) - expected).abs() < 5e-3, "{i}: {} is not {expected}", grads[i]);
+            }
+            for i in 0..d_g.len() {
+                let at = |h: f32| { let mut g = g.clone(); g[i] += h; loss(&grid, &table, &x, &g, &d_e, &d_n) };
+                let expected = at(0.5) - at(-0.5);
+                assert!((f64::from(d_g[i]) - expected).abs() < 5e-3, "{i}: {} is not {expected}", d_g[i]);
+            }
+        }
+    }
+
+    #[test]
+    fn a_dense_level_is_continuous_over_the_whole_cube_and_inactive_levels_are_zero() {
+        let grid = HashGrid::new(HashGridOptions { levels: 1, features: 1, log2_entries: 12, coarsest: 4, finest: 4 });
+        // theta = x + 10 y + 100 z at the corners must come back everywhere, also on the border and outside.
+        let table: Vec<f32> =
+            (0..125).map(|i| (i % 5) as f32 + 10.0 * (i / 5 % 5) as f32 + 100.0 * (i / 25) as f32).collect();
+        for (p, expected) in [([0.0; 3], 0.0), ([1.0; 3], 444.0), ([0.5, 0.25, 0.8], 332.0), ([2.0, -1.0, 0.0], 4.0)] {
+            let mut out = [0.0];
+            grid.forward(&table, &[p], 1, &mut out, 1, 0);
+            assert!((out[0] - expected).abs() < 1e-3, "{} is not {expected}", out[0]);
+            grid.forward(&table, &[p], 0, &mut out, 1, 0);
+            assert_eq!(out[0], 0.0);
+        }
+    }
+}
