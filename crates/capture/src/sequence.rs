@@ -51,6 +51,9 @@ pub struct SequenceMeta {
     /// What it was imported or simulated from.
     #[serde(default)]
     pub source: String,
+    /// Time of each frame in seconds from the first, in the order of the frame numbers; `None` where unknown.
+    #[serde(default)]
+    pub frame_times_s: Option<Vec<f64>>,
     /// Seed, options and versions of the program that wrote the sequence.
     #[serde(default)]
     pub provenance: serde_json::Value,
