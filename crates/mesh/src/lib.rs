@@ -6,13 +6,23 @@
 #![allow(clippy::needless_range_loop, reason = "kernels index several small arrays by axis and child")]
 
 mod bvh;
+mod files;
+mod glb;
 mod kd_tree;
+mod obj;
+mod ply;
 mod poisson_disk;
 mod sample;
+mod stl;
 mod triangle_mesh;
 
 pub use bvh::{Bvh, Closest, Hit, closest_point_on_triangle};
+pub use files::{Dropped, read_mesh, read_mesh_lenient, read_ply, write_mesh};
+pub use glb::write_glb;
 pub use kd_tree::KdTree;
+pub use obj::write_obj;
+pub use ply::write_ply;
 pub use poisson_disk::sample_poisson_disk;
 pub use sample::{SurfaceSample, sample_uniform};
+pub use stl::write_stl;
 pub use triangle_mesh::TriangleMesh;

@@ -46,6 +46,48 @@ impl TriangleMesh {
         Aabb::of(&self.vertices)
     }
 
+    /// Keeps the vertices marked in `keep` (one entry a vertex) and the triangles whose three corners are kept; returns
+    /// the number of triangles that went.
+    ///
+    /// # Panics
+    /// Where `keep` has another length.
+    pub fn retain_vertices(&mut self, keep: &[bool]) -> usize {
+        assert_eq!(keep.len(), self.vertices.len(), "one mark a vertex");
+        let mut next = 0;
+        let new_index: Vec<u32> = keep
+            .iter()
+            .map(|&keep| {
+                next += u32::from(keep);
+                next.wrapping_sub(1)
+            })
+            .collect();
+        retain_marked(&mut self.vertices, keep);
+        if let Some(colors) = &mut self.vertex_colors {
+            retain_marked(colors, keep);
+        }
+        let kept: Vec<bool> = self.triangles.iter().map(|t| t.iter().all(|&v| keep[v as usize])).collect();
+        self.retain_triangles(&kept);
+        for corner in self.triangles.as_flattened_mut() {
+            *corner = new_index[*corner as usize];
+        }
+        kept.iter().filter(|kept| !**kept).count()
+    }
+
+    /// Keeps the triangles marked in `keep` (one entry a triangle), and every vertex.
+    ///
+    /// # Panics
+    /// Where `keep` has another length.
+    pub fn retain_triangles(&mut self, keep: &[bool]) {
+        assert_eq!(keep.len(), self.triangles.len(), "one mark a triangle");
+        retain_marked(&mut self.triangles, keep);
+        if let Some(colors) = &mut self.triangle_colors {
+            retain_marked(colors, keep);
+        }
+        if let Some(parts) = &mut self.triangle_parts {
+            retain_marked(parts, keep);
+        }
+    }
+
     /// The same mesh in another frame.
     #[must_use]
     pub fn transformed<To, From>(mut self, to_from_from: &Rigid3<To, From>) -> Self {
@@ -54,4 +96,9 @@ impl TriangleMesh {
         }
         self
     }
+}
+
+fn retain_marked<T>(items: &mut Vec<T>, keep: &[bool]) {
+    let mut marks = keep.iter();
+    items.retain(|_| *marks.next().expect("one mark an item"));
 }
