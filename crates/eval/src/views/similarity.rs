@@ -36,7 +36,11 @@ const BAND_ROWS: usize = 96;
 /// Values (pixels times channels) of a column strip; the sliding rows of a strip then stay in the second-level cache.
 const STRIP: usize = 320 * CHANNELS;
 const HALO: usize = RADIUS * CHANNELS;
-/// What SSIM needs of every window: the means of x, y, x^2 + y^2 and xy.
+/// What is averaged over every window: u = x + y and v = x - y of the two images, and their squares.
+///
+/// With U, V the means of u, v and A, B their variances, `SSIM = (U^2 - V^2 + 2 C1) (A - B + 2 C2) / ((U^2 + V^2 + 2 C1)
+/// (A + B + 2 C2))`, which is the usual formula in other letters. In f32 it is the better one: A, where rounding is
+/// largest, stands in numerator and denominator alike, and B is small and exact where the images are alike.
 const MAPS: usize = 4;
 /// Independent partial sums, so that the compiler may use vectors and yet the order is fixed.
 const LANES: usize = 16;
@@ -90,11 +94,14 @@ fn band_avx2(a: &ColorImage, b: &ColorImage, mask: Option<&Mask>, first: usize) 
     band_portable(a, b, mask, first)
 }
 
-/// Centre and right half of the normalised Gaussian window.
+/// Centre and right half of the normalised Gaussian window. The centre takes up the rounding of the rest: a sum that is
+/// off by e adds e x^2 to every variance, which flat parts would show.
 fn window() -> [f32; RADIUS + 1] {
     let weight = |i: usize| (-((i * i) as f64) / (2.0 * 1.5 * 1.5)).exp();
     let total: f64 = weight(0) + 2.0 * (1..=RADIUS).map(weight).sum::<f64>();
-    std::array::from_fn(|i| (weight(i) / total) as f32)
+    let mut window: [f32; RADIUS + 1] = std::array::from_fn(|i| (weight(i) / total) as f32);
+    window[0] = (1.0 - 2.0 * window[1..].iter().map(|&w| f64::from(w)).sum::<f64>()) as f32;
+    window
 }
 
 /// Rows `first..first + BAND_ROWS`: slides down each strip, keeping the horizontally blurred maps of 11 rows.
@@ -150,13 +157,13 @@ fn load(xs: &[f32], ys: &[f32], left: usize, n: usize, padded: &mut [[f32; STRIP
         map[..offset].fill(0.0);
         map[end..].fill(0.0);
     }
-    let [map_x, map_y, map_squares, map_product] = padded;
-    map_x[offset..end].copy_from_slice(&xs[from..to]);
-    map_y[offset..end].copy_from_slice(&ys[from..to]);
-    let maps = map_squares[offset..end].iter_mut().zip(&mut map_product[offset..end]);
-    for ((squares, product), (x, y)) in maps.zip(xs[from..to].iter().zip(&ys[from..to])) {
-        *squares = x * x + y * y;
-        *product = x * y;
+    let [u, v, uu, vv] = padded.each_mut().map(|map| &mut map[offset..end]);
+    for (i, (x, y)) in xs[from..to].iter().zip(&ys[from..to]).enumerate() {
+        let (sum, difference) = (x + y, x - y);
+        u[i] = sum;
+        v[i] = difference;
+        uu[i] = sum * sum;
+        vv[i] = difference * difference;
     }
 }
 
@@ -180,17 +187,16 @@ fn ssim_row(rows: &[&[[f32; STRIP]; MAPS]; TAPS], window: &[f32; RADIUS + 1], ss
     let n = ssim.len();
     let at: [[&[f32]; MAPS]; TAPS] = std::array::from_fn(|k| std::array::from_fn(|map| &rows[k][map][..n]));
     for (i, ssim) in ssim.iter_mut().enumerate() {
-        let [x, y, squares, product]: [f32; MAPS] = std::array::from_fn(|map| {
+        let [u, v, uu, vv]: [f32; MAPS] = std::array::from_fn(|map| {
             let mut sum = window[0] * at[RADIUS][map][i];
             for k in 1..=RADIUS {
                 sum += window[k] * (at[RADIUS - k][map][i] + at[RADIUS + k][map][i]);
             }
             sum
         });
-        let mean_squares = x * x + y * y;
-        let mean_product = x * y;
-        let (variances, covariance) = (squares - mean_squares, product - mean_product);
-        *ssim = (2.0 * mean_product + C1) * (2.0 * covariance + C2) / ((mean_squares + C1) * (variances + C2));
+        let (u, v) = (u * u, v * v);
+        let (a, b) = (uu - u, vv - v);
+        *ssim = (u - v + 2.0 * C1) * (a - b + 2.0 * C2) / ((u + v + 2.0 * C1) * (a + b + 2.0 * C2));
     }
 }
 
