@@ -1,5 +1,14 @@
 //! Learned scene representations trained on one capture: NeRF, NeuS and DVGO on kernels of our own.
 
+pub mod adam;
+pub mod composite;
+pub mod contraction;
+pub mod dataset;
+pub mod dense_grid;
+pub mod encoding;
 pub mod hash_grid;
 pub mod mlp;
+pub mod occupancy;
+pub mod region;
+pub mod sampling;
 pub mod simd;

@@ -1,0 +1,144 @@
+//! Alpha compositing along a ray, and its derivative.
+//!
+//! Sample i has opacity `alpha_i` and colour `c_i`; `T_i = prod_{j<i} (1 - alpha_j)` is what reaches it,
+//! `w_i = T_i alpha_i` its weight, and the pixel is `C = sum_i w_i c_i + T_n background`.
+//!
+//! Let a loss have the derivatives `dC`, `dw_i` (for losses on weights or depth) and `dT` (on what is left). With
+//! `q_i = dC . c_i + dw_i` and `Q`, the value of everything behind a sample, from back to front
+//! `Q_n = dC . background + dT`, `Q_{i-1} = alpha_i q_i + (1 - alpha_i) Q_i`, the derivatives are
+//! `d alpha_i = T_i (q_i - Q_i)` and `dc_i = w_i dC`: no division, also where a sample is opaque.
+
+/// A composited ray.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Composite {
+    /// C, including the background.
+    pub rgb: [f32; 3],
+    /// T_n: what no sample stopped.
+    pub transmittance: f32,
+}
+
+/// What a loss asks of one composited ray.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CompositeGradient {
+    /// dC.
+    pub d_rgb: [f32; 3],
+    /// dT.
+    pub d_transmittance: f32,
+}
+
+/// Composites a ray; `weights` receives `w_i`.
+pub fn composite(alphas: &[f32], colors: &[[f32; 3]], background: [f32; 3], weights: &mut [f32]) -> Composite {
+    let mut rgb = [0.0; 3];
+    let mut transmittance = 1.0;
+    for ((alpha, color), weight) in alphas.iter().zip(colors).zip(weights) {
+        *weight = transmittance * alpha;
+        for d in 0..3 {
+            rgb[d] += *weight * color[d];
+        }
+        transmittance *= 1.0 - alpha;
+    }
+    for d in 0..3 {
+        rgb[d] += transmittance * background[d];
+    }
+    Composite { rgb, transmittance }
+}
+
+/// The derivatives of [`composite`]. `d_alphas` holds `dw_i` when it is called and `d alpha_i` when it returns;
+/// `weights` are those of the forward pass.
+pub fn composite_backward(
+    alphas: &[f32],
+    colors: &[[f32; 3]],
+    background: [f32; 3],
+    weights: &[f32],
+    composite: &Composite,
+    gradient: &CompositeGradient,
+    d_alphas: &mut [f32],
+    d_colors: &mut [[f32; 3]],
+) {
+    let d = gradient.d_rgb;
+    let dot = |c: [f32; 3]| d[0] * c[0] + d[1] * c[1] + d[2] * c[2];
+    // What reaches each sample, front to back, is kept in d_colors until it is overwritten.
+    let mut reach = 1.0;
+    for (alpha, slot) in alphas.iter().zip(d_colors.iter_mut()) {
+        slot[0] = reach;
+        reach *= 1.0 - alpha;
+    }
+    debug_assert!((reach - composite.transmittance).abs() < 1e-4);
+    let mut behind = dot(background) + gradient.d_transmittance;
+    for i in (0..alphas.len()).rev() {
+        let value = dot(colors[i]) + d_alphas[i];
+        d_alphas[i] = d_colors[i][0] * (value - behind);
+        behind = alphas[i] * value + (1.0 - alphas[i]) * behind;
+        d_colors[i] = d.map(|d| d * weights[i]);
+    }
+}
+
+/// Opacity of a stretch of length `dt` with density `sigma`: `1 - exp(-sigma dt)`.
+pub fn opacity(sigma: f32, dt: f32) -> f32 {
+    -(-sigma * dt).exp_m1()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn a_homogeneous_slab_follows_beer_and_lambert() {
+        // Density 2 over a length of 1.5, white on black: 1 - exp(-3), however the slab is cut.
+        for n in [1, 7, 100] {
+            let alphas = vec![opacity(2.0, 1.5 / n as f32); n];
+            let mut weights = vec![0.0; n];
+            let c = composite(&alphas, &vec![[1.0; 3]; n], [0.0; 3], &mut weights);
+            assert!((c.rgb[0] - (1.0 - (-3.0f32).exp())).abs() < 1e-5 && (c.transmittance - (-3.0f32).exp()).abs() < 1e-5);
+            assert!((weights.iter().sum::<f32>() + c.transmittance - 1.0).abs() < 1e-5);
+        }
+    }
+
+    #[test]
+    fn an_opaque_sample_hides_everything_behind_it_without_a_division_by_zero() {
+        let (alphas, colors) = ([0.5, 1.0, 0.5], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
+        let mut weights = [0.0; 3];
+        let c = composite(&alphas, &colors, [9.0; 3], &mut weights);
+        assert_eq!((c.rgb, c.transmittance), ([0.5, 0.5, 0.0], 0.0));
+        let mut d_alphas = [0.0; 3];
+        let gradient = CompositeGradient { d_rgb: [0.0, 1.0, 0.0], d_transmittance: 0.0 };
+        composite_backward(&alphas, &colors, [9.0; 3], &weights, &c, &gradient, &mut d_alphas, &mut [[0.0; 3]; 3]);
+        // Behind the opaque green sample lies half of blue and half of the background, 4.5 in green.
+        assert_eq!(d_alphas, [-1.0, 0.5 * (1.0 - 4.5), 0.0]);
+    }
+
+    proptest! {
+        #[test]
+        fn derivatives_agree_with_finite_differences(
+            samples in proptest::collection::vec((0.0..0.95f32, proptest::array::uniform3(0.0..1.0f32), -1.0..1.0f32), 1..12),
+            background in proptest::array::uniform3(0.0..1.0f32), d_rgb in proptest::array::uniform3(-1.0..1.0f32), d_t in -1.0..1.0f32,
+        ) {
+            let alphas: Vec<f32> = samples.iter().map(|s| s.0).collect();
+            let colors: Vec<[f32; 3]> = samples.iter().map(|s| s.1).collect();
+            let d_weights: Vec<f32> = samples.iter().map(|s| s.2).collect();
+            let loss = |alphas: &[f32], colors: &[[f32; 3]]| {
+                let (mut t, mut sum) = (1.0f64, 0.0f64);
+                for i in 0..alphas.len() {
+                    let w = t * f64::from(alphas[i]);
+                    sum += w * f64::from(d_weights[i]);
+                    sum += (0..3).map(|d| w * f64::from(colors[i][d]) * f64::from(d_rgb[d])).sum::<f64>();
+                    t *= 1.0 - f64::from(alphas[i]);
+                }
+                sum + t * (f64::from(d_t) + (0..3).map(|d| f64::from(background[d] * d_rgb[d])).sum::<f64>())
+            };
+            let mut weights = vec![0.0; alphas.len()];
+            let c = composite(&alphas, &colors, background, &mut weights);
+            let (mut d_alphas, mut d_colors) = (d_weights.clone(), vec![[0.0; 3]; alphas.len()]);
+            let gradient = CompositeGradient { d_rgb, d_transmittance: d_t };
+            composite_backward(&alphas, &colors, background, &weights, &c, &gradient, &mut d_alphas, &mut d_colors);
+            for i in 0..alphas.len() {
+                // The loss is linear in each alpha and in each colour: any step is exact.
+                let at = |h: f32| { let mut a = alphas.clone(); a[i] += h; loss(&a, &colors) };
+                prop_assert!((at(0.05) - at(-0.05) - 0.1 * f64::from(d_alphas[i])).abs() < 1e-5);
+                let at = |h: f32| { let mut c = colors.clone(); c[i][1] += h; loss(&alphas, &c) };
+                prop_assert!((at(0.5) - at(-0.5) - f64::from(d_colors[i][1])).abs() < 1e-5);
+            }
+        }
+    }
+}

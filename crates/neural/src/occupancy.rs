@@ -1,0 +1,107 @@
+//! A grid of cells that may hold something, so that samples are spent where matter is.
+//!
+//! The grid covers the unit cube. Each cell keeps a running maximum of a field's density, `v = max(0.95 v, density)`
+//! at a random point of the cell, as in instant-ngp. A sixteenth of the cells is refreshed at a time, in turn.
+
+use mb_job::rng;
+use rand::RngExt;
+use rayon::prelude::*;
+
+/// The cells, x fastest.
+#[derive(Debug, Clone)]
+pub struct OccupancyGrid {
+    resolution: usize,
+    /// Running maximum of the density; infinite before the first look.
+    pub values: Vec<f32>,
+    occupied: Vec<bool>,
+}
+
+/// A cell is refreshed in every sixteenth update.
+const TURNS: usize = 16;
+/// What a running maximum keeps at each refresh.
+const DECAY: f32 = 0.95;
+/// Positions that the field is asked for at once.
+const PIECE: usize = 4096;
+
+impl OccupancyGrid {
+    /// `resolution`^3 cells, all occupied.
+    pub fn new(resolution: usize) -> Self {
+        let cells = resolution.pow(3);
+        Self { resolution, values: vec![f32::INFINITY; cells], occupied: vec![true; cells] }
+    }
+
+    /// Cells a side.
+    pub fn resolution(&self) -> usize {
+        self.resolution
+    }
+
+    /// Whether the cell around a point of the unit cube may hold something.
+    #[inline(always)]
+    pub fn is_occupied(&self, p: [f32; 3]) -> bool {
+        let r = self.resolution;
+        let index = |v: f32| ((v * r as f32).max(0.0) as usize).min(r - 1);
+        self.occupied[(index(p[2]) * r + index(p[1])) * r + index(p[0])]
+    }
+
+    /// Share of the cells that are occupied.
+    pub fn share(&self) -> f64 {
+        self.occupied.iter().filter(|o| **o).count() as f64 / self.occupied.len() as f64
+    }
+
+    /// Refreshes one sixteenth of the cells (all of them where `all`), the `turn`-th, by asking `density` for points of
+    /// the unit cube; then decides with `threshold` which cells are occupied.
+    pub fn update(&mut self, seed: u64, turn: u64, all: bool, threshold: f32, density: impl Fn(&[[f32; 3]], &mut Vec<f32>) + Sync) {
+        let r = self.resolution;
+        let offset = turn as usize % TURNS;
+        self.values.par_chunks_mut(PIECE).enumerate().for_each(|(piece, values)| {
+            let mut rng = rng(seed, turn.wrapping_mul(1 << 20) + piece as u64);
+            let cells: Vec<usize> =
+                (0..values.len()).filter(|i| all || (piece * PIECE + i) % TURNS == offset).collect();
+            let positions: Vec<[f32; 3]> = cells
+                .iter()
+                .map(|i| {
+                    let i = piece * PIECE + i;
+                    [i % r, i / r % r, i / (r * r)].map(|c| (c as f32 + rng.random::<f32>()) / r as f32)
+                })
+                .collect();
+            let mut found = Vec::with_capacity(cells.len());
+            density(&positions, &mut found);
+            for (i, density) in cells.into_iter().zip(found) {
+                let kept = if values[i].is_finite() { DECAY * values[i] } else { 0.0 };
+                values[i] = kept.max(density);
+            }
+        });
+        self.decide(threshold);
+    }
+
+    /// Marks the cells whose value exceeds the threshold.
+    pub fn decide(&mut self, threshold: f32) {
+        self.occupied.par_iter_mut().zip(&self.values).for_each(|(o, v)| *o = *v > threshold);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_ball_is_found_and_forgotten() {
+        let ball = |positions: &[[f32; 3]], out: &mut Vec<f32>| {
+            out.extend(positions.iter().map(|p| {
+                let d: f32 = p.iter().map(|c| (c - 0.5).powi(2)).sum();
+                if d < 0.09 { 10.0 } else { 0.0 }
+            }));
+        };
+        let mut grid = OccupancyGrid::new(32);
+        assert_eq!(grid.share(), 1.0);
+        for turn in 0..16 {
+            grid.update(0, turn, false, 1.0, ball);
+        }
+        assert!(grid.is_occupied([0.5; 3]) && !grid.is_occupied([0.05; 3]) && !grid.is_occupied([1.5; 3]));
+        assert!((grid.share() - 4.0 / 3.0 * std::f64::consts::PI * 0.027).abs() < 0.02, "{}", grid.share());
+        for turn in 0..60 {
+            grid.update(0, turn, true, 1.0, |p, out| out.resize(p.len(), 0.0));
+        }
+        assert_eq!(grid.share(), 0.0);
+    }
+}
