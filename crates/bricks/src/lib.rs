@@ -39,3 +39,4 @@ pub use ldraw::library::PartLibrary;
 pub use ldraw::load::MissingPart;
 pub use ldraw::shape::PartShape;
 pub use model::{Model, Occurrence, PartInstance, ReadOptions};
+pub use parametric::drawable_parts;
