@@ -1,0 +1,140 @@
+//! What to simulate.
+
+use mb_geometry::ImageSize;
+use mb_job::{Error, Result};
+use serde::{Deserialize, Serialize};
+
+/// How much work goes into a photograph. Geometry, cameras, depth and poses are the same in all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Quality {
+    /// Two samples a pixel, coarse ambient light: for demos and tests.
+    Draft,
+    /// Four samples a pixel, soft shadows, ambient light and reflections traced at half resolution.
+    Standard,
+    /// Eight samples a pixel, everything traced finely.
+    Photo,
+}
+
+/// What the model stands on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Table {
+    /// A bamboo board on a dark sofa.
+    Bamboo,
+    /// A desk of oak planks.
+    Oak,
+    /// A checked tablecloth.
+    Gingham,
+    /// A coarse linen cloth with a printed pattern.
+    Linen,
+}
+
+impl Table {
+    /// Every table.
+    pub const ALL: [Self; 4] = [Self::Bamboo, Self::Oak, Self::Gingham, Self::Linen];
+}
+
+/// How far the poses that the phone reports stray from the true ones.
+///
+/// Both figures are the paper's: errors of the relative poses over all pairs of frames, with nothing aligned. The shape of the
+/// drift is random; its size is scaled so that every simulated sequence has these figures. The defaults are the ARKit
+/// row of the paper's pose table.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DriftOptions {
+    /// Root mean square error of relative translations, millimetres. From more than about 45 cm away the rotations alone
+    /// make a larger one.
+    pub translation_rmse_mm: f64,
+    /// Mean error of relative rotations, degrees.
+    pub rotation_mean_deg: f64,
+    /// Expected number of relocalisation jumps in a sequence, at which the phone takes half of its drift back.
+    pub relocalisations: f64,
+}
+
+impl Default for DriftOptions {
+    fn default() -> Self {
+        Self { translation_rmse_mm: 4.454, rotation_mean_deg: 0.581, relocalisations: 0.5 }
+    }
+}
+
+/// What to simulate. Plain data; unknown keys are refused.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimulateOptions {
+    /// Number of photographs, 1 to 100,000.
+    pub frames: usize,
+    /// Size of the photographs. Intrinsics scale with the longer side.
+    pub size: ImageSize,
+    /// Effort per photograph.
+    pub quality: Quality,
+    /// Seed of everything that is random.
+    pub seed: u64,
+    /// Mean distance from the camera to the middle of the model, metres; `None` takes the smallest distance of at
+    /// least 25 cm that keeps the whole model in view in every frame.
+    pub radius_m: Option<f64>,
+    /// One circle round the model for each entry: the camera's angle above the table, degrees, in (0, 85].
+    pub elevations_deg: Vec<f64>,
+    /// What the model stands on; `None` lets the seed choose.
+    pub table: Option<Table>,
+    /// Errors of the reported poses.
+    pub drift: DriftOptions,
+    /// Number of points that the simulated annotator clicks.
+    pub keypoints: usize,
+    /// Standard deviation of a click, pixels of a 1920-pixel-wide photograph.
+    pub keypoint_noise_px: f64,
+}
+
+impl Default for SimulateOptions {
+    fn default() -> Self {
+        Self {
+            frames: 60,
+            size: mb_capture::Sequence::PUBLISHED_SIZE,
+            quality: Quality::Standard,
+            seed: 0,
+            radius_m: None,
+            elevations_deg: vec![28.0, 50.0],
+            table: None,
+            drift: DriftOptions::default(),
+            keypoints: 20,
+            keypoint_noise_px: 2.0,
+        }
+    }
+}
+
+impl SimulateOptions {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// A sentence that names the field, what it is, and what it may be.
+    pub fn validate(&self) -> Result<()> {
+        let need = |ok: bool, sentence: String| if ok { Ok(()) } else { Err(Error::Failed(sentence)) };
+        let fits = |v: f64, low: f64, high: f64| v.is_finite() && v >= low && v <= high;
+        need((1..=100_000).contains(&self.frames), format!("frames is {}, must be 1 to 100000", self.frames))?;
+        need(
+            (64..=8192).contains(&self.size.width) && (64..=8192).contains(&self.size.height),
+            format!("size is {}, each side must be 64 to 8192 pixels", self.size),
+        )?;
+        if let Some(radius) = self.radius_m {
+            need(fits(radius, 0.02, 10.0), format!("radius_m is {radius}, must be 0.02 to 10"))?;
+        }
+        need(
+            !self.elevations_deg.is_empty() && self.elevations_deg.iter().all(|e| *e > 0.0 && *e <= 85.0),
+            format!("elevations_deg is {:?}, needs at least one angle above 0 and at most 85", self.elevations_deg),
+        )?;
+        let drift = &self.drift;
+        need(
+            fits(drift.translation_rmse_mm, 0.0, 1000.0)
+                && fits(drift.rotation_mean_deg, 0.0, 30.0)
+                && fits(drift.relocalisations, 0.0, 100.0),
+            format!("drift is {drift:?}, needs 0 to 1000 mm, 0 to 30 degrees and 0 to 100 relocalisations"),
+        )?;
+        need(
+            self.keypoints <= 1000 && fits(self.keypoint_noise_px, 0.0, 100.0),
+            format!(
+                "keypoints is {} with noise {} px, may be at most 1000 and 100 px",
+                self.keypoints, self.keypoint_noise_px
+            ),
+        )
+    }
+}
