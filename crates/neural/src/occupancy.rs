@@ -17,7 +17,7 @@ pub struct OccupancyGrid {
 }
 
 /// A cell is refreshed in every sixteenth update.
-const TURNS: usize = 16;
+pub const TURNS: u64 = 16;
 /// What a running maximum keeps at each refresh.
 const DECAY: f32 = 0.95;
 /// Positions that the field is asked for at once.
@@ -52,11 +52,11 @@ impl OccupancyGrid {
     /// the unit cube; then decides with `threshold` which cells are occupied.
     pub fn update(&mut self, seed: u64, turn: u64, all: bool, threshold: f32, density: impl Fn(&[[f32; 3]], &mut Vec<f32>) + Sync) {
         let r = self.resolution;
-        let offset = turn as usize % TURNS;
+        let offset = (turn % TURNS) as usize;
         self.values.par_chunks_mut(PIECE).enumerate().for_each(|(piece, values)| {
             let mut rng = rng(seed, turn.wrapping_mul(1 << 20) + piece as u64);
             let cells: Vec<usize> =
-                (0..values.len()).filter(|i| all || (piece * PIECE + i) % TURNS == offset).collect();
+                (0..values.len()).filter(|i| all || (piece * PIECE + i) % TURNS as usize == offset).collect();
             let positions: Vec<[f32; 3]> = cells
                 .iter()
                 .map(|i| {

@@ -1,0 +1,56 @@
+//! What the trainer needs of a method.
+
+use crate::dataset::{RayDataset, SceneRay};
+
+/// What one training step found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepReport {
+    /// The whole loss.
+    pub loss: f64,
+    /// Mean squared error of the colours, sRGB in 0..=1.
+    pub mse: f64,
+    /// Rays of the step.
+    pub rays: usize,
+    /// Samples of the step.
+    pub samples: usize,
+}
+
+/// Where a method's surface is: the level set of a function.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Level {
+    /// The value on the surface.
+    pub value: f32,
+    /// Whether larger values lie inside (densities) or outside (distances).
+    pub larger_inside: bool,
+}
+
+/// A scene representation that learns from rays. Everything that a step depends on is the model's state, the data, the
+/// seed and the step's number: a model restored from a checkpoint goes on exactly as if it had never stopped.
+pub trait Model: Sync {
+    /// `nerf`, `neus`, `dvgo`.
+    fn name(&self) -> &'static str;
+    /// Steps of a whole run.
+    fn iterations(&self) -> u64;
+    /// One step, counted from 0.
+    fn step(&mut self, data: &RayDataset, step: u64) -> StepReport;
+    /// Colours of rays.
+    fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]>;
+    /// The surface's level.
+    fn level(&self) -> Level;
+    /// The function whose level set is the surface, at points of the scene frame.
+    fn surface(&self, positions: &[[f32; 3]]) -> Vec<f32>;
+    /// Everything that a checkpoint holds, always in the same order.
+    fn buffers(&mut self) -> Vec<&mut Vec<f32>>;
+    /// Called after a checkpoint has been read into the buffers, before `step`.
+    fn restored(&mut self, step: u64);
+    /// Whether every parameter is a finite number.
+    fn is_finite(&self) -> bool;
+    /// Number of parameters.
+    fn parameter_count(&self) -> usize;
+}
+
+/// Independent pieces of a step. Fixed, because each piece has its own stream of random numbers and its own sums.
+pub const GROUPS: usize = 32;
+
+/// Samples that go through the networks at once: their activations stay in the second-level cache.
+pub const TILE: usize = 512;
