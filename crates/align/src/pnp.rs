@@ -90,9 +90,9 @@ pub enum PnpError {
     /// The mirror image of the 3D points fits and the points do not.
     #[error("the mirror image of the 3D points fits ({mirrored_px:.1} px), the points themselves do not ({px:.1} px)")]
     Mirrored {
-        /// Median residual of the points.
+        /// Root mean square residual of the points, wrong clicks counted at the limit.
         px: f64,
-        /// Median residual of their mirror image.
+        /// The same for their mirror image.
         mirrored_px: f64,
     },
     /// Two different poses fit equally well.
@@ -191,15 +191,17 @@ pub fn estimate_pose(
     let rms_px = rms(&residuals, &inliers);
     let agreeing = inliers.iter().filter(|&&i| i).count();
 
-    if rms_px > 1.5 * options.click_noise_px * std::f64::consts::SQRT_2 || 2 * agreeing <= points {
+    // A pose found from good clicks of the right hand explains them all; only then is its mirror image not worth a try.
+    if agreeing < points || rms_px > 2.0 * options.click_noise_px {
         let mirrored: Vec<Correspondence> = correspondences
             .iter()
             .map(|c| Correspondence { point_in_object: mirrored(&c.point_in_object), ..*c })
             .collect();
         let twin = Problem::new(cameras, &mirrored);
         if let Some(fit) = twin.best_fit(options) {
-            let (px, mirrored_px) = (median(&residuals), median(&twin.residuals(&fit.pose)));
-            if mirrored_px < 0.4 * px {
+            let (px, mirrored_px) =
+                (truncated_rms(&residuals, limit_px), truncated_rms(&twin.residuals(&fit.pose), limit_px));
+            if mirrored_px < 0.5 * px {
                 return Err(PnpError::Mirrored { px, mirrored_px });
             }
         }
@@ -286,6 +288,12 @@ fn median(residuals: &[Option<Vector2<f64>>]) -> f64 {
     let mut lengths: Vec<f64> = residuals.iter().map(|r| r.map_or(f64::INFINITY, |r| r.norm())).collect();
     lengths.sort_by(f64::total_cmp);
     lengths[lengths.len() / 2]
+}
+
+/// Root mean square residual where none counts for more than `limit_px`.
+fn truncated_rms(residuals: &[Option<Vector2<f64>>], limit_px: f64) -> f64 {
+    let sum: f64 = residuals.iter().map(|r| r.map_or(limit_px, |r| r.norm().min(limit_px)).powi(2)).sum();
+    (sum / residuals.len() as f64).sqrt()
 }
 
 fn rms(residuals: &[Option<Vector2<f64>>], chosen: &[bool]) -> f64 {
