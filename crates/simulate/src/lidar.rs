@@ -92,7 +92,7 @@ pub(crate) fn measure(
             let place = vec3(&(*object_from_cam * p));
             let camera = object_from_cam.translation();
             let towards = (Vec3::new(camera.x as f32, camera.y as f32, camera.z as f32) - place).normalize();
-            let surface = stage.surface(exact.triangle[(cx, cy)], place, towards);
+            let surface = stage.surface(exact.triangle[(cx, cy)], place, towards, (mean / view.intrinsics.fx) as f32);
             let facing = f64::from(surface.normal.dot(towards).max(0.0));
             let bright = f64::from(surface.finish.albedo.element_sum() / 3.0);
             let strength = (facing * (0.15 + bright) / (mean * mean).max(0.04) * 0.5).min(1.0);

@@ -126,7 +126,7 @@ impl Pass<'_> {
         let triangle = self.raster.triangle[(x, y)];
         let place = self.place(x, y, z);
         let view = (camera - place).normalize();
-        let mut surface = stage.surface(triangle, place, view);
+        let mut surface = stage.surface(triangle, place, view, z / self.view.intrinsics.fx as f32);
         let arriving = self.probes.at(x as f32, y as f32, place, stage.normal(triangle, place, view));
         let mut seam = 0.0;
         if stage.is_model(triangle) {

@@ -59,6 +59,9 @@ pub(crate) struct Probes<'a> {
 /// Rays end here: further surfaces count as part of the room.
 const REACH_M: f64 = 0.8;
 
+/// Detail of surfaces that light bounces off: finer would be noise.
+const BOUNCE_DETAIL_M: f32 = 0.005;
+
 fn ray(from: Vec3, normal: Vec3, towards: Vec3) -> Ray {
     let start = from + normal * 3e-5;
     Ray {
@@ -92,7 +95,7 @@ fn trace(stage: &Stage, tracing: Tracing, place: Vec3, normal: Vec3, noise: u32)
         };
         // One bounce: what that surface sends on of the window's light, and of a typical share of the room's.
         let p = place + towards * hit.t as f32;
-        let surface = stage.surface(hit.triangle, p, -towards);
+        let surface = stage.surface(hit.triangle, p, -towards, BOUNCE_DETAIL_M);
         let facing = surface.normal.dot(light.window).max(0.0);
         let lit = if facing <= 0.0 {
             0.0

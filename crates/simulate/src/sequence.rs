@@ -276,7 +276,7 @@ fn photograph(
             );
             developments(&shoot(0, small, crate::Quality::Draft), options.frames, options.seed)
         });
-        let photo = develop(shoot(i, options.size, options.quality), &exposures[i], frame_salt(i));
+        let photo = develop(&shoot(i, options.size, options.quality), &exposures[i], frame_salt(i));
         let t = orbit.time_s(i);
         let (depth, confidence) =
             lidar::measure(stage, &orbit.intrinsics(t), &photo, &orbit.object_from_cam(t), options.seed, i as u64);

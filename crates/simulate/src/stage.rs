@@ -275,30 +275,32 @@ impl Stage {
     }
 
     /// Colour and finish at `p` on `triangle`.
-    fn finish(&self, triangle: u32, p: Vec3) -> (Finish, Option<&Patch>) {
+    fn finish(&self, triangle: u32, p: Vec3, pixel_m: f32) -> (Finish, Option<&Patch>) {
         let t = triangle as usize;
         if t < self.model_triangles {
-            return (Finish { albedo: self.albedos[t], roughness: 0.24, slope: (0.0, 0.0) }, None);
+            return (Finish { albedo: self.albedos[t], roughness: 0.2, slope: (0.0, 0.0) }, None);
         }
         let index = self.patch_of[t - self.model_triangles];
         let patch = &self.patches[usize::from(index)];
         let d = p - patch.origin;
-        let (x, y) = (d.dot(patch.x_axis), d.dot(patch.y_axis));
+        let at = (d.dot(patch.x_axis), d.dot(patch.y_axis));
         let salt = self.salt ^ u32::from(index).wrapping_mul(0x85EB_CA6B);
         let finish = match patch.material {
-            Material::Table => texture::table(self.table_kind, x, y, self.table_half_m, salt),
-            Material::Surroundings => texture::surroundings(x, y, salt),
-            Material::Edge => texture::edge(x, y, salt),
-            Material::Plaster => texture::plaster(x, y, salt),
-            Material::Clutter(base) => texture::clutter(base, x, y, salt),
+            Material::Table => texture::table(self.table_kind, at, pixel_m, self.table_half_m, salt),
+            Material::Surroundings => texture::surroundings(at, pixel_m, salt),
+            Material::Edge => texture::edge(at, salt),
+            Material::Plaster => texture::plaster(at, salt),
+            Material::Clutter(base) => texture::clutter(base, at, salt),
         };
         (finish, Some(patch))
     }
 
-    /// The surface at `p` on `triangle`, with relief, its normal towards `view` (unit, from the surface).
-    pub fn surface(&self, triangle: u32, p: Vec3, view: Vec3) -> Surface {
+    /// The surface at `p` on `triangle`, with relief, its normal towards `view` (unit, from the surface). Detail below
+    /// `pixel_m` (the size of a pixel that faces it) is left out.
+    pub fn surface(&self, triangle: u32, p: Vec3, view: Vec3, pixel_m: f32) -> Surface {
         let mut normal = self.normal(triangle, p, view);
-        let (finish, patch) = self.finish(triangle, p);
+        let slanted_m = pixel_m / normal.dot(view).max(0.1);
+        let (finish, patch) = self.finish(triangle, p, slanted_m);
         if let Some(patch) = patch {
             let (sx, sy) = finish.slope;
             normal = (normal - patch.x_axis * sx - patch.y_axis * sy).normalize();
