@@ -124,17 +124,17 @@ fn band_portable(a: &ColorImage, b: &ColorImage, mask: Option<&Mask>, first: usi
                 Some(entering) => {
                     load(a.row(entering).as_flattened(), b.row(entering).as_flattened(), left, n, &mut padded);
                     for (blurred, padded) in slot.iter_mut().zip(&padded) {
-                        blur_row(padded, &window, &mut blurred[..n]);
+                        blur_row(padded, &window, blurred);
                     }
                 }
-                None => slot.iter_mut().for_each(|map| map[..n].fill(0.0)),
+                None => slot.iter_mut().for_each(|map| map.fill(0.0)),
             }
             let Some(y) = (first + step).checked_sub(2 * RADIUS).filter(|_| step >= 2 * RADIUS) else { continue };
             if let Some(mask) = mask {
                 let mask = mask.row(y);
                 weights[..n].iter_mut().zip(left..).for_each(|(w, i)| *w = f32::from(u8::from(mask[i / CHANNELS])));
             }
-            ssim_row(&std::array::from_fn(|k| &ring[(step + 1 + k) % TAPS]), &window, &mut values[..n]);
+            ssim_row(&std::array::from_fn(|k| &ring[(step + 1 + k) % TAPS]), &window, &mut values);
             sums.ssim += weighted_sum(&values[..n], &weights[..n]);
             let (xs, ys) = (&a.row(y).as_flattened()[left..left + n], &b.row(y).as_flattened()[left..left + n]);
             for (value, (x, y)) in values.iter_mut().zip(xs.iter().zip(ys)) {
@@ -169,34 +169,31 @@ fn load(xs: &[f32], ys: &[f32], left: usize, n: usize, padded: &mut [[f32; STRIP
 
 /// Convolves a row with the window; neighbours of one channel are three values apart.
 #[inline(always)]
-fn blur_row(padded: &[f32; STRIP + 2 * HALO], window: &[f32; RADIUS + 1], blurred: &mut [f32]) {
-    let n = blurred.len();
-    let at: [&[f32]; TAPS] = std::array::from_fn(|k| &padded[k * CHANNELS..k * CHANNELS + n]);
-    for (i, blurred) in blurred.iter_mut().enumerate() {
-        let mut sum = window[0] * at[RADIUS][i];
+fn blur_row(padded: &[f32; STRIP + 2 * HALO], window: &[f32; RADIUS + 1], blurred: &mut [f32; STRIP]) {
+    for i in 0..STRIP {
+        let mut sum = window[0] * padded[i + HALO];
         for k in 1..=RADIUS {
-            sum += window[k] * (at[RADIUS - k][i] + at[RADIUS + k][i]);
+            sum += window[k] * (padded[i + HALO - k * CHANNELS] + padded[i + HALO + k * CHANNELS]);
         }
-        *blurred = sum;
+        blurred[i] = sum;
     }
 }
 
 /// Finishes the blur down the columns, and computes SSIM of every value.
 #[inline(always)]
-fn ssim_row(rows: &[&[[f32; STRIP]; MAPS]; TAPS], window: &[f32; RADIUS + 1], ssim: &mut [f32]) {
-    let n = ssim.len();
-    let at: [[&[f32]; MAPS]; TAPS] = std::array::from_fn(|k| std::array::from_fn(|map| &rows[k][map][..n]));
-    for (i, ssim) in ssim.iter_mut().enumerate() {
-        let [u, v, uu, vv]: [f32; MAPS] = std::array::from_fn(|map| {
-            let mut sum = window[0] * at[RADIUS][map][i];
+fn ssim_row(rows: &[&[[f32; STRIP]; MAPS]; TAPS], window: &[f32; RADIUS + 1], ssim: &mut [f32; STRIP]) {
+    for i in 0..STRIP {
+        let mut mean = [0f32; MAPS];
+        for map in 0..MAPS {
+            mean[map] = window[0] * rows[RADIUS][map][i];
             for k in 1..=RADIUS {
-                sum += window[k] * (at[RADIUS - k][map][i] + at[RADIUS + k][map][i]);
+                mean[map] += window[k] * (rows[RADIUS - k][map][i] + rows[RADIUS + k][map][i]);
             }
-            sum
-        });
+        }
+        let [u, v, uu, vv] = mean;
         let (u, v) = (u * u, v * v);
         let (a, b) = (uu - u, vv - v);
-        *ssim = (u - v + 2.0 * C1) * (a - b + 2.0 * C2) / ((u + v + 2.0 * C1) * (a + b + 2.0 * C2));
+        ssim[i] = (u - v + 2.0 * C1) * (a - b + 2.0 * C2) / ((u + v + 2.0 * C1) * (a + b + 2.0 * C2));
     }
 }
 
