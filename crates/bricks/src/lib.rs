@@ -22,13 +22,16 @@
 //! Conditional lines are ignored. Meshes of library parts are not closed; those that we draw ourselves are.
 
 mod clearance;
+mod demo;
 mod flat;
 mod info;
 mod ldraw;
 mod model;
 mod parametric;
+mod sketch;
 mod write;
 
+pub use demo::demo_model;
 pub use flat::{METRES_PER_LDU, MeshOptions, NO_PART, object_from_ldraw};
 pub use info::{BomLine, BoxInfo, ModelInfo};
 pub use ldraw::colors::{Color, ColorCode, ColorTable};

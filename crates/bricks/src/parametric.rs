@@ -7,6 +7,9 @@
 pub(crate) mod block;
 pub(crate) mod catalog;
 pub(crate) mod columns;
+mod round;
+mod slope;
+mod special;
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -41,7 +44,7 @@ fn ldraw_text(design: &Design) -> String {
     let mut text = format!("0 {}\n0 Name: {}.dat\n", design.title, design.number);
     text.push_str("0 // Closed surface with nominal dimensions, drawn by MobileBrick\n");
     text.push_str("0 !LDRAW_ORG Unofficial_Part\n0 BFC CERTIFY CCW\n");
-    let mut point = |text: &mut String, p: &Point3<f64>| {
+    let point = |text: &mut String, p: &Point3<f64>| {
         for v in [p.x, p.y, p.z] {
             // Four decimals are 0.04 micrometres. Adding 0.0 turns -0 into 0.
             let v = (v * 1e4).round() / 1e4 + 0.0;
@@ -93,6 +96,15 @@ mod tests {
             let surface = design.solid().surface();
             assert_closed(&surface, design.title);
             assert!(volume(&surface) > 0.0, "{}", design.title);
+        }
+    }
+
+    #[test]
+    fn every_part_can_be_read_back() {
+        for (number, title) in drawable_parts() {
+            let file = part_file(&format!("{number}.dat")).unwrap();
+            assert_eq!(file.description, title);
+            assert!(!file.faces.is_empty() && file.faces.iter().all(|face| !face.two_sided), "{number}");
         }
     }
 

@@ -7,7 +7,7 @@ use std::path::Path;
 use mb_job::{Result, write_atomic};
 
 use crate::ldraw::colors::ColorCode;
-use crate::ldraw::file::FileKind;
+use crate::ldraw::file::{FileId, FileKind};
 use crate::model::Model;
 
 impl Model {
@@ -45,6 +45,33 @@ impl Model {
             text.push_str("0 NOFILE\n");
         }
         text
+    }
+
+    /// The model as LDraw text that refers to parts by name: one file, or an MPD where there are submodels.
+    pub fn to_ldraw(&self) -> String {
+        let own: Vec<_> = self.used_files().iter().filter(|&&id| self.is_own(id)).collect();
+        if let [only] = own[..] {
+            return self.file(*only).text.clone();
+        }
+        let mut text = String::new();
+        for &id in own {
+            let file = self.file(id);
+            let _ = writeln!(text, "0 FILE {}\n{}\n0 NOFILE", file.name, file.text.trim_end());
+        }
+        text
+    }
+
+    /// Writes [`Model::to_ldraw`] to a file.
+    ///
+    /// # Errors
+    /// `Error::Write`.
+    pub fn write_ldraw(&self, path: impl AsRef<Path>) -> Result<()> {
+        write_atomic(path, self.to_ldraw().as_bytes())
+    }
+
+    /// Whether the file came with the model, not from a library.
+    fn is_own(&self, id: FileId) -> bool {
+        self.file(id).kind == FileKind::Model || self.file(id).source == self.file(self.root()).source
     }
 
     /// Writes [`Model::to_self_contained`] to a file.

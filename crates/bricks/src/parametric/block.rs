@@ -83,17 +83,22 @@ pub(crate) fn hollow(solid: &mut Columns, footprint: Footprint, height: f64) {
     solid.empty(footprint.outline(WALL), [WALL, height + OVERLAP]);
     for center in footprint.between() {
         if footprint.is_narrow() {
-            solid.fill(circle(center, PIN_RADIUS), [WALL - OVERLAP, height]);
+            solid.post(circle(center, PIN_RADIUS), height);
         } else {
             tube(solid, center, height);
         }
     }
 }
 
-/// A tube from the top of a hollow down to `bottom`.
+/// A tube from the ceiling of a hollow down to `bottom`.
 pub(crate) fn tube(solid: &mut Columns, center: [f64; 2], bottom: f64) {
-    solid.fill(circle(center, TUBE_RADIUS), [WALL - OVERLAP, bottom]);
-    solid.empty(circle(center, STUD_RADIUS), [WALL, bottom + OVERLAP]);
+    solid.tube(circle(center, TUBE_RADIUS), circle(center, STUD_RADIUS), bottom);
+}
+
+/// A stud with a round hole from its top down to the height `floor`.
+pub(crate) fn hollow_stud(solid: &mut Columns, center: [f64; 2], y: f64, floor: f64) {
+    stud(solid, center, y);
+    solid.empty(circle(center, PIN_RADIUS), [y - STUD_HEIGHT - OVERLAP, floor]);
 }
 
 /// A stud on the top at height `y`.

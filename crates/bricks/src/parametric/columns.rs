@@ -49,6 +49,12 @@ impl Plane {
         Self::through([a[0], a[1], 0.0], [b[0], b[1], 0.0], [a[0], a[1], 1.0])
     }
 
+    /// The same slope, higher by `lift`.
+    #[must_use]
+    pub fn raised(self, lift: f64) -> Self {
+        Self { at_origin: self.at_origin - lift, ..self }
+    }
+
     fn at(&self, [x, z]: [f64; 2]) -> f64 {
         self.at_origin + self.slope[0] * x + self.slope[1] * z
     }
@@ -93,10 +99,18 @@ pub(crate) struct Columns {
 
 #[derive(Debug, Clone)]
 struct Operation {
-    outline: Outline,
-    top: Plane,
-    bottom: Plane,
-    fill: bool,
+    /// Loops, inside by the even-odd rule.
+    loops: Vec<Outline>,
+    change: Change,
+}
+
+/// What happens over the outline.
+#[derive(Debug, Clone, Copy)]
+enum Change {
+    Fill(Plane, Plane),
+    Empty(Plane, Plane),
+    /// What hangs lowest grows down to here.
+    Extend(Plane),
 }
 
 /// A closed surface, LDraw units, counter-clockwise seen from outside.
@@ -109,29 +123,39 @@ pub(crate) struct Surface {
 impl Columns {
     /// Fills the space over `outline` between two planes.
     pub fn fill_between(&mut self, outline: Outline, top: Plane, bottom: Plane) -> &mut Self {
-        self.push(outline, top, bottom, true)
+        self.push(vec![outline], Change::Fill(top, bottom))
     }
 
     /// Empties the space over `outline` between two planes.
     pub fn empty_between(&mut self, outline: Outline, top: Plane, bottom: Plane) -> &mut Self {
-        self.push(outline, top, bottom, false)
+        self.push(vec![outline], Change::Empty(top, bottom))
     }
 
     /// Fills the space over `outline` between two heights.
     pub fn fill(&mut self, outline: Outline, y: [f64; 2]) -> &mut Self {
-        self.push(outline, Plane::level(y[0]), Plane::level(y[1]), true)
+        self.fill_between(outline, Plane::level(y[0]), Plane::level(y[1]))
     }
 
     /// Empties the space over `outline` between two heights.
     pub fn empty(&mut self, outline: Outline, y: [f64; 2]) -> &mut Self {
-        self.push(outline, Plane::level(y[0]), Plane::level(y[1]), false)
+        self.empty_between(outline, Plane::level(y[0]), Plane::level(y[1]))
     }
 
-    fn push(&mut self, outline: Outline, top: Plane, bottom: Plane, fill: bool) -> &mut Self {
+    /// A post from whatever ceiling there is over `outline` down to `bottom`.
+    pub fn post(&mut self, outline: Outline, bottom: f64) -> &mut Self {
+        self.push(vec![outline], Change::Extend(Plane::level(bottom)))
+    }
+
+    /// A tube from whatever ceiling there is down to `bottom`.
+    pub fn tube(&mut self, outer: Outline, inner: Outline, bottom: f64) -> &mut Self {
+        self.push(vec![outer, inner], Change::Extend(Plane::level(bottom)))
+    }
+
+    fn push(&mut self, mut loops: Vec<Outline>, change: Change) -> &mut Self {
         // On a binary grid, sums and differences of coordinates are exact.
-        let snap = |v: f64| (v * 1_048_576.0).round() / 1_048_576.0;
-        let outline = outline.into_iter().map(|[x, z]| [snap(x), snap(z)]).collect();
-        self.operations.push(Operation { outline, top, bottom, fill });
+        let snap = |v: &mut f64| *v = (*v * 1_048_576.0).round() / 1_048_576.0;
+        loops.iter_mut().flatten().flatten().for_each(snap);
+        self.operations.push(Operation { loops, change });
         self
     }
 
@@ -143,9 +167,9 @@ impl Columns {
 
     fn cut_ground(&self) -> Result<Ground, InsertionError> {
         let mut ground = Ground::new();
-        for operation in &self.operations {
+        for outline in self.operations.iter().flat_map(|operation| &operation.loops) {
             let corners: Vec<_> =
-                operation.outline.iter().map(|&[x, z]| ground.insert(Point2::new(x, z))).collect::<Result<_, _>>()?;
+                outline.iter().map(|&[x, z]| ground.insert(Point2::new(x, z))).collect::<Result<_, _>>()?;
             for (index, &from) in corners.iter().enumerate() {
                 let to = corners[(index + 1) % corners.len()];
                 if from != to {
@@ -159,39 +183,55 @@ impl Columns {
     /// The filled intervals over a point of the ground, from top to bottom.
     fn stack(&self, at: [f64; 2]) -> Vec<[Plane; 2]> {
         let mut stack: Vec<[Plane; 2]> = vec![];
-        for operation in self.operations.iter().filter(|operation| contains(&operation.outline, at)) {
-            let (top, bottom) = (operation.top.at(at), operation.bottom.at(at));
-            let mut changed = vec![];
-            let mut filled = [operation.top, operation.bottom];
-            for interval in stack {
-                let [t, b] = interval.map(|plane| plane.at(at));
-                if operation.fill {
-                    if b < top - SAME_LDU || t > bottom + SAME_LDU {
-                        changed.push(interval);
-                        continue;
-                    }
-                    if t < filled[0].at(at) {
-                        filled[0] = interval[0];
-                    }
-                    if b > filled[1].at(at) {
-                        filled[1] = interval[1];
-                    }
-                } else {
-                    if t < top - SAME_LDU {
-                        changed.push([interval[0], if b < top { interval[1] } else { operation.top }]);
-                    }
-                    if b > bottom + SAME_LDU {
-                        changed.push([if t > bottom { interval[0] } else { operation.bottom }, interval[1]]);
-                    }
-                }
+        for operation in &self.operations {
+            let inside = operation.loops.iter().filter(|outline| contains(outline, at)).count() % 2 == 1;
+            if inside {
+                stack = changed(stack, operation.change, at);
             }
-            if operation.fill {
-                changed.push(filled);
-            }
-            changed.sort_by(|a, b| ascending(a[0].at(at), b[0].at(at)));
-            stack = changed;
         }
         stack
+    }
+}
+
+/// The intervals over a point after one change, from top to bottom.
+fn changed(mut stack: Vec<[Plane; 2]>, change: Change, at: [f64; 2]) -> Vec<[Plane; 2]> {
+    match change {
+        Change::Fill(top, bottom) => {
+            let mut filled = [top, bottom];
+            stack.retain(|[t, b]| {
+                let apart = b.at(at) < top.at(at) - SAME_LDU || t.at(at) > bottom.at(at) + SAME_LDU;
+                if !apart && t.at(at) < filled[0].at(at) {
+                    filled[0] = *t;
+                }
+                if !apart && b.at(at) > filled[1].at(at) {
+                    filled[1] = *b;
+                }
+                apart
+            });
+            stack.push(filled);
+            stack.sort_by(|a, b| ascending(a[0].at(at), b[0].at(at)));
+            stack
+        }
+        Change::Empty(top, bottom) => {
+            let mut left = vec![];
+            for [t, b] in stack {
+                if t.at(at) < top.at(at) - SAME_LDU {
+                    left.push([t, if b.at(at) < top.at(at) { b } else { top }]);
+                }
+                if b.at(at) > bottom.at(at) + SAME_LDU {
+                    left.push([if t.at(at) > bottom.at(at) { t } else { bottom }, b]);
+                }
+            }
+            left
+        }
+        Change::Extend(bottom) => {
+            if let Some([_, lowest]) = stack.last_mut()
+                && lowest.at(at) < bottom.at(at)
+            {
+                *lowest = bottom;
+            }
+            stack
+        }
     }
 }
 
