@@ -7,7 +7,8 @@
 mod alignment;
 mod keypoints;
 mod matrix_txt;
-mod pickle;
+mod neus_cameras;
+pub mod pickle;
 mod pose_folder;
 mod sequence;
 mod visibility;
@@ -15,6 +16,7 @@ mod visibility;
 pub use alignment::{Alignment, AlignmentStage, FrameAlignment};
 pub use keypoints::{Keypoint, Keypoints};
 pub use matrix_txt::{read_intrinsics_txt, read_pose_txt, write_intrinsics_txt, write_pose_txt};
+pub use neus_cameras::write_neus_cameras;
 pub use pose_folder::PoseFolder;
 pub use sequence::{Frame, FrameId, Sequence, SequenceMeta};
 pub use visibility::VisibilityVolume;

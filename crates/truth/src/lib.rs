@@ -1,1 +1,16 @@
-//! (story to be written by the crate)
+//! Exact ground truth of an aligned sequence.
+//!
+//! The model's triangles (`model/mesh.ply`) and the alignment (`alignment/alignment.json`) come in; exact depth, masks,
+//! the surface that the cameras saw, the volume that they could judge, and the published layout's own mesh go out.
+//! [`truth`] does all of it for a sequence; [`ExactScene`] gives the depth of one frame without the rounding of files.
+//!
+//! Everything is as exact as the alignment: this crate reads the file and does not know how it was found. Limits: the
+//! scene is the model alone, so a table or a hand that hides part of it is not in the truth.
+
+mod exact_scene;
+mod truth;
+mod visibility;
+mod visible_surface;
+
+pub use exact_scene::ExactScene;
+pub use truth::{TruthOptions, TruthSummary, truth};

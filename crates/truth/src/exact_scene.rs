@@ -1,0 +1,57 @@
+//! The model in the sequence's world, and what each camera sees of it.
+
+use mb_capture::{Alignment, Frame, Sequence};
+use mb_geometry::{ImageSize, World};
+use mb_job::{InputError, Result};
+use mb_mesh::TriangleMesh;
+use mb_render::{Raster, Scene, View};
+
+/// The aligned model of a sequence with its cameras.
+pub struct ExactScene {
+    /// The model, world frame, metres.
+    pub mesh: TriangleMesh,
+    /// The sequence's frames with aligned poses.
+    pub frames: Vec<Frame>,
+    size: ImageSize,
+    scene: Scene,
+}
+
+impl ExactScene {
+    /// Places the sequence's model by its alignment.
+    ///
+    /// # Errors
+    /// The sequence has no model or no alignment, or either is malformed.
+    pub fn open(sequence: &Sequence) -> Result<Self> {
+        Self::with_alignment(sequence, &sequence.read_alignment()?)
+    }
+
+    /// Places the sequence's model by a given alignment.
+    ///
+    /// # Errors
+    /// The sequence has no model, or it is malformed or without triangles.
+    pub fn with_alignment(sequence: &Sequence, alignment: &Alignment) -> Result<Self> {
+        let path = sequence.model_mesh_path();
+        if !path.exists() {
+            return Err(InputError::new(path, "the sequence carries no model")
+                .help("Write the model's geometry there with `mobilebrick model mesh MODEL -o SEQ/model/mesh.ply`")
+                .into());
+        }
+        let mesh = mb_mesh::read_mesh(&path)?;
+        if mesh.triangles.is_empty() {
+            return Err(InputError::new(path, "the model has no triangles").into());
+        }
+        let mesh = mesh.transformed(&alignment.world_from_object);
+        let scene = Scene::new(&mesh);
+        Ok(Self { mesh, frames: sequence.aligned_frames(alignment), size: sequence.image_size(), scene })
+    }
+
+    /// The camera of a frame, at the photographs' size.
+    pub fn view(&self, frame: &Frame) -> View<World> {
+        View { intrinsics: frame.intrinsics, size: self.size, cam_from_frame: frame.world_from_cam.inverse() }
+    }
+
+    /// Exact depth and triangle ids of a frame, at the photographs' size.
+    pub fn render(&self, frame: &Frame) -> Raster {
+        self.scene.render(&self.view(frame))
+    }
+}
