@@ -23,9 +23,12 @@
 
 mod raster;
 mod ray_cast;
+mod scene;
 mod setup;
+mod strip;
 mod view;
 
-pub use raster::{NO_TRIANGLE, Raster, Scene};
+pub use raster::{NO_TRIANGLE, Raster};
 pub use ray_cast::ray_cast;
+pub use scene::Scene;
 pub use view::View;
