@@ -5,7 +5,10 @@
 //! leave this crate are OpenCV-style and metric (`docs/formats.md` has the layout file by file).
 
 mod alignment;
+mod colmap_model;
+mod import;
 mod keypoints;
+mod lens;
 mod matrix_txt;
 mod neus_cameras;
 pub mod pickle;
@@ -14,7 +17,9 @@ mod sequence;
 mod visibility;
 
 pub use alignment::{Alignment, AlignmentStage, FrameAlignment};
+pub use import::{CaptureFormat, ImportOptions, ImportSummary, SkippedFrame, import};
 pub use keypoints::{Keypoint, Keypoints};
+pub use lens::{Distortion, Lens};
 pub use matrix_txt::{read_intrinsics_txt, read_pose_txt, write_intrinsics_txt, write_pose_txt};
 pub use neus_cameras::write_neus_cameras;
 pub use pose_folder::PoseFolder;

@@ -70,6 +70,31 @@ pub fn read_rgb(path: impl AsRef<Path>) -> Result<RgbImage> {
     Ok(with_size(size, pixels))
 }
 
+/// Decodes a PNG or JPEG photograph that is in memory as 8-bit RGB; grey is spread over the channels, alpha is
+/// dropped. `path` names it in errors.
+///
+/// # Errors
+/// The bytes are damaged, no PNG or JPEG, or of more than [`MAX_PIXELS`].
+pub fn decode_rgb(bytes: &[u8], path: &Path) -> Result<RgbImage> {
+    let reader = || {
+        let reader = ImageReader::new(std::io::Cursor::new(bytes))
+            .with_guessed_format()
+            .map_err(|e| InputError::unreadable(path, &e))?;
+        match reader.format() {
+            Some(_) => Ok(reader),
+            None => Err(InputError::new(path, "neither a PNG nor a JPEG image")),
+        }
+    };
+    let (width, height) = reader()?.into_dimensions().map_err(|e| damaged(path, &e))?;
+    let size = ImageSize::new(width as usize, height as usize);
+    if size.pixels() == 0 || size.pixels() > MAX_PIXELS {
+        return Err(InputError::new(path, format!("{size} pixels, allowed are 1 to {MAX_PIXELS}")).into());
+    }
+    let image = reader()?.decode().map_err(|e| damaged(path, &e))?;
+    let pixels = image.into_rgb8().into_raw().chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
+    Ok(with_size(size, pixels))
+}
+
 /// Reads a PNG or JPEG photograph as sRGB fractions of full scale, in [0, 1], keeping all bits: 8-bit values are
 /// divided by 255, 16-bit values by 65535. Grey is spread over the channels; an alpha channel must be opaque throughout.
 ///

@@ -8,6 +8,6 @@ mod io;
 
 pub use grid::{Confidence, DepthImage, Image, Mask, RgbImage};
 pub use io::{
-    MAX_PIXELS, read_confidence_png, read_depth_png, read_depth_png_mm, read_mask_png, read_rgb, read_rgb_fraction,
-    read_size, write_confidence_png, write_depth_png, write_jpeg, write_mask_png, write_rgb_png,
+    MAX_PIXELS, decode_rgb, read_confidence_png, read_depth_png, read_depth_png_mm, read_mask_png, read_rgb,
+    read_rgb_fraction, read_size, write_confidence_png, write_depth_png, write_jpeg, write_mask_png, write_rgb_png,
 };
