@@ -8,6 +8,7 @@ use mb_job::Silent;
 use mb_neural::dataset::{DataOptions, RayDataset};
 use mb_neural::model::Model;
 use mb_neural::nerf::{Nerf, NerfOptions};
+use mb_neural::neus::{Neus, NeusOptions};
 use mb_neural::trainer::{image_psnr_db, psnr_db, render_view};
 
 fn main() {
@@ -28,6 +29,7 @@ fn main() {
             schedule: mb_neural::adam::Schedule::WarmExponential { warm_up: 100, end: steps, floor: 0.03 },
             ..NerfOptions::default()
         })),
+        "neus" => Box::new(Neus::new(NeusOptions::default().with_iterations(steps), &data)),
         other => panic!("no method {other}"),
     };
     let (clock, cpu) = (std::time::Instant::now(), ProcessTime::now());

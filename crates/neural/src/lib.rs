@@ -11,6 +11,8 @@ pub mod mlp;
 pub mod model;
 pub mod network;
 pub mod nerf;
+pub mod neus;
+pub mod neus_alpha;
 pub mod occupancy;
 pub mod radiance_field;
 pub mod region;

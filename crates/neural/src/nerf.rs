@@ -68,8 +68,8 @@ impl Default for NerfOptions {
             schedule: Schedule::WarmExponential { warm_up: 100, end: 6_000, floor: 0.03 },
             near: 0.2,
             far: 64.0,
-            step: 0.012,
-            cone: 1.0 / 192.0,
+            step: 0.02,
+            cone: 1.0 / 96.0,
             occupancy: 128,
             occupancy_every: 16,
             object_only: false,
@@ -246,22 +246,26 @@ impl Nerf {
         }
     }
 
-    fn occupancy_threshold(&self) -> f32 {
-        // A cell counts where a shortest step through it stops a hundredth of the light, as in instant-ngp.
-        0.01 / self.options.step
+    /// A cell counts where a shortest step through it stops a hundredth of the light, or, while everything is thin,
+    /// where it is denser than the mean (as in instant-ngp). After the first round a haze below four times the mean
+    /// has to go, or a processor would spend most of its samples on it.
+    fn occupancy_threshold(&self, turn: u64) -> f32 {
+        let thin = self.occupancy.mean() * if turn < TURNS { 1.0 } else { 4.0 };
+        thin.min(0.01 / self.options.step)
     }
 
     /// The `turn`-th refresh. Turns 1, 3, 7, 15 look at every cell, so that empty space is left early.
     fn refresh_occupancy(&mut self, turn: u64) {
         let all = turn < TURNS && (turn + 1).is_power_of_two();
-        let (field, parameters, threshold) = (&self.field, &self.parameters, self.occupancy_threshold());
-        self.occupancy.update(self.options.seed ^ 0x6f63, turn, all, threshold, |positions, out| {
+        let (field, parameters) = (&self.field, &self.parameters);
+        self.occupancy.update(self.options.seed ^ 0x6f63, turn, all, 0.95, |positions, out| {
             let mut worker = RadianceWorker::default();
             for tile in positions.chunks(TILE) {
                 field.density(parameters, tile, &mut worker);
                 out.extend_from_slice(&worker.sigma);
             }
         });
+        self.occupancy.decide(self.occupancy_threshold(turn));
     }
 }
 
@@ -343,8 +347,11 @@ impl Model for Nerf {
         all
     }
 
-    fn restored(&mut self, _step: u64) {
-        self.occupancy.decide(self.occupancy_threshold());
+    fn restored(&mut self, step: u64) {
+        let turn = step / self.options.occupancy_every;
+        if turn > 0 {
+            self.occupancy.decide(self.occupancy_threshold(turn));
+        }
     }
 
     fn is_finite(&self) -> bool {

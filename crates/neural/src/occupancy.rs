@@ -1,7 +1,7 @@
 //! A grid of cells that may hold something, so that samples are spent where matter is.
 //!
-//! The grid covers the unit cube. Each cell keeps a running maximum of a field's density, `v = max(0.95 v, density)`
-//! at a random point of the cell, as in instant-ngp. A sixteenth of the cells is refreshed at a time, in turn.
+//! The grid covers the unit cube. Each cell keeps a running maximum of a field's density, `v = max(decay v, density)`
+//! at a random point of the cell (instant-ngp has 0.95). A sixteenth of the cells is refreshed at a time, in turn.
 
 use mb_job::rng;
 use rand::RngExt;
@@ -18,8 +18,6 @@ pub struct OccupancyGrid {
 
 /// A cell is refreshed in every sixteenth update.
 pub const TURNS: u64 = 16;
-/// What a running maximum keeps at each refresh.
-const DECAY: f32 = 0.95;
 /// Positions that the field is asked for at once.
 const PIECE: usize = 4096;
 
@@ -49,8 +47,15 @@ impl OccupancyGrid {
     }
 
     /// Refreshes one sixteenth of the cells (all of them where `all`), the `turn`-th, by asking `density` for points of
-    /// the unit cube; then decides with `threshold` which cells are occupied.
-    pub fn update(&mut self, seed: u64, turn: u64, all: bool, threshold: f32, density: impl Fn(&[[f32; 3]], &mut Vec<f32>) + Sync) {
+    /// the unit cube. A running maximum keeps the share `decay` at each refresh. Call [`Self::decide`] afterwards.
+    pub fn update(
+        &mut self,
+        seed: u64,
+        turn: u64,
+        all: bool,
+        decay: f32,
+        density: impl Fn(&[[f32; 3]], &mut Vec<f32>) + Sync,
+    ) {
         let r = self.resolution;
         let offset = (turn % TURNS) as usize;
         self.values.par_chunks_mut(PIECE).enumerate().for_each(|(piece, values)| {
@@ -67,11 +72,16 @@ impl OccupancyGrid {
             let mut found = Vec::with_capacity(cells.len());
             density(&positions, &mut found);
             for (i, density) in cells.into_iter().zip(found) {
-                let kept = if values[i].is_finite() { DECAY * values[i] } else { 0.0 };
+                let kept = if values[i].is_finite() { decay * values[i] } else { 0.0 };
                 values[i] = kept.max(density);
             }
         });
-        self.decide(threshold);
+    }
+
+    /// Mean of the cells that have been looked at; infinite before the first look.
+    pub fn mean(&self) -> f32 {
+        let (sum, n) = self.values.iter().filter(|v| v.is_finite()).fold((0.0, 0), |(s, n), v| (s + f64::from(*v), n + 1));
+        if n == 0 { f32::INFINITY } else { (sum / f64::from(n)) as f32 }
     }
 
     /// Marks the cells whose value exceeds the threshold.
@@ -95,12 +105,14 @@ mod tests {
         let mut grid = OccupancyGrid::new(32);
         assert_eq!(grid.share(), 1.0);
         for turn in 0..16 {
-            grid.update(0, turn, false, 1.0, ball);
+            grid.update(0, turn, false, 0.95, ball);
+            grid.decide(1.0);
         }
         assert!(grid.is_occupied([0.5; 3]) && !grid.is_occupied([0.05; 3]) && !grid.is_occupied([1.5; 3]));
         assert!((grid.share() - 4.0 / 3.0 * std::f64::consts::PI * 0.027).abs() < 0.02, "{}", grid.share());
         for turn in 0..60 {
-            grid.update(0, turn, true, 1.0, |p, out| out.resize(p.len(), 0.0));
+            grid.update(0, turn, true, 0.95, |p, out| out.resize(p.len(), 0.0));
+            grid.decide(1.0);
         }
         assert_eq!(grid.share(), 0.0);
     }

@@ -120,6 +120,9 @@ pub fn train(
         if point_due {
             let point = window.point(step, clock.elapsed().as_secs_f64());
             window = Window::default();
+            if point.samples_per_ray == 0.0 {
+                return Err(diverged(step, "nothing is left of the scene", run));
+            }
             // The first steps of a method with a warm-up are no measure; afterwards nothing makes the error ten times
             // the best but a loss of control.
             if step > total / 20 {

@@ -1,0 +1,618 @@
+//! NeuS on a hash grid (`neus --preset fast`): a signed distance field, rendered through its logistic density.
+//!
+//! Inside the unit ball (the region of interest) a ray is sampled where the surface may be: in cells whose distance is
+//! within the reach of the logistic density, with steps that shorten as it sharpens. Behind the ball, where there are
+//! no masks, a radiance field on contracted space ([`crate::radiance_field`]) is the background. All samples of a ray
+//! are composited together. The loss is
+//!
+//! `mean |C - C*| + eikonal * mean (|n| - 1)^2 + mask * BCE(1 - T, mask)`,
+//!
+//! the second over the samples and over random points of the ball. Levels of the hash grid join one by one (coarse to
+//! fine), so that the shape settles before its details. All derivatives are exact ([`crate::sdf_field`],
+//! [`crate::neus_alpha`], [`crate::composite`]).
+
+use mb_job::{Rng, rng};
+use rand::RngExt;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::adam::{AdamOptions, Parameters, Schedule};
+use crate::composite::{Composite, CompositeGradient, composite, composite_backward, opacity};
+use crate::contraction::contract;
+use crate::dataset::{RayDataset, SceneRay, TargetRay};
+use crate::hash_grid::HashGridOptions;
+use crate::model::{GROUPS, Level, Model, StepReport, TILE};
+use crate::neus_alpha::Section;
+use crate::occupancy::{OccupancyGrid, TURNS};
+use crate::radiance_field::{RadianceField, RadianceFieldOptions, RadianceParameters, RadianceWorker, Transposed};
+use crate::sdf_field::{DirectionEncoding, PositionEncoding, SdfField, SdfFieldOptions, SdfWorker};
+
+/// How a fast NeuS is trained. Lengths are in radii of the region of interest.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NeusOptions {
+    /// Steps.
+    pub iterations: u64,
+    /// Samples inside the ball that a step aims at; the number of rays follows.
+    pub samples_per_step: usize,
+    /// The surface.
+    pub field: SdfFieldOptions,
+    /// What lies behind the ball; not used with masks.
+    pub background: RadianceFieldOptions,
+    /// Learning rate of the hash tables.
+    pub table_learning_rate: f32,
+    /// Learning rate of the networks (NeuS: 5e-4).
+    pub learning_rate: f32,
+    /// Learning rate of the sharpness.
+    pub sharpness_learning_rate: f32,
+    /// Their course.
+    pub schedule: Schedule,
+    /// The sharpness starts at exp(10 v) with this v (NeuS: 0.3).
+    pub initial_sharpness: f32,
+    /// Steps until rays must face the surface (NeuS: 50,000 of 300,000).
+    pub anneal: u64,
+    /// Weight of the eikonal loss (NeuS: 0.1).
+    pub eikonal: f32,
+    /// Learn only what the masks show, where there are masks.
+    pub use_masks: bool,
+    /// Weight of the mask loss (NeuS: 0.1 with masks).
+    pub mask: f32,
+    /// Levels of the hash grid in use at the start.
+    pub first_levels: usize,
+    /// Steps between further levels.
+    pub level_every: u64,
+    /// Longest step inside the ball.
+    pub longest_step: f32,
+    /// Shortest step inside the ball.
+    pub shortest_step: f32,
+    /// First step of the background as a share of the distance.
+    pub background_cone: f32,
+    /// Farthest sample of the background.
+    pub far: f32,
+    /// Cells a side of both occupancy grids.
+    pub occupancy: usize,
+    /// Steps between refreshes of a sixteenth of the grids.
+    pub occupancy_every: u64,
+    /// Random numbers.
+    pub seed: u64,
+}
+
+impl Default for NeusOptions {
+    /// The preset `fast`.
+    fn default() -> Self {
+        let iterations = 6_000;
+        Self {
+            iterations,
+            samples_per_step: 1 << 15,
+            field: SdfFieldOptions {
+                position: PositionEncoding::Hash(HashGridOptions {
+                    levels: 8,
+                    features: 4,
+                    log2_entries: 17,
+                    coarsest: 16,
+                    finest: 512,
+                }),
+                direction: DirectionEncoding::Harmonics,
+                width: 64,
+                hidden: 1,
+                skip: None,
+                features: 15,
+                softplus: 100.0,
+                color_width: 64,
+                color_hidden: 2,
+                weight_norm: false,
+                initial_radius: 0.5,
+            },
+            background: RadianceFieldOptions {
+                grid: HashGridOptions { levels: 8, features: 4, log2_entries: 15, coarsest: 16, finest: 256 },
+                width: 32,
+                color_hidden: 1,
+            },
+            table_learning_rate: 1e-2,
+            learning_rate: 2e-3,
+            sharpness_learning_rate: 1e-3,
+            schedule: Schedule::WarmExponential { warm_up: 100, end: iterations, floor: 0.03 },
+            initial_sharpness: 0.3,
+            anneal: iterations / 6,
+            eikonal: 0.1,
+            use_masks: true,
+            mask: 0.1,
+            first_levels: 3,
+            level_every: iterations / 12,
+            longest_step: 0.04,
+            shortest_step: 0.006,
+            background_cone: 1.0 / 48.0,
+            far: 32.0,
+            occupancy: 64,
+            occupancy_every: 16,
+            seed: 0,
+        }
+    }
+}
+
+impl NeusOptions {
+    /// The same with another number of steps: everything that is counted in steps follows.
+    #[must_use]
+    pub fn with_iterations(mut self, iterations: u64) -> Self {
+        self.iterations = iterations;
+        self.schedule = Schedule::WarmExponential { warm_up: 100.min(iterations / 10), end: iterations, floor: 0.03 };
+        self.anneal = iterations / 6;
+        self.level_every = (iterations / 12).max(1);
+        self
+    }
+}
+
+/// Samples of a tile: inside the ball, behind it, and both together ray by ray.
+#[derive(Debug, Default)]
+struct Tile {
+    inner: Vec<[f32; 3]>,
+    inner_dt: Vec<f32>,
+    inner_runs: Vec<(u32, [f32; 3])>,
+    outer: Vec<[f32; 3]>,
+    outer_dt: Vec<f32>,
+    outer_runs: Vec<(u32, [f32; 3])>,
+    keep: Vec<u32>,
+    alphas: Vec<f32>,
+    rgb: Vec<[f32; 3]>,
+    weights: Vec<f32>,
+    composites: Vec<Composite>,
+    d_alphas: Vec<f32>,
+    d_rgb: Vec<[f32; 3]>,
+}
+
+impl Tile {
+    fn clear(&mut self) {
+        self.inner.clear();
+        self.inner_dt.clear();
+        self.inner_runs.clear();
+        self.outer.clear();
+        self.outer_dt.clear();
+        self.outer_runs.clear();
+    }
+}
+
+#[derive(Debug, Default)]
+struct Group {
+    sdf: SdfWorker,
+    outside: RadianceWorker,
+    tile: Tile,
+    rays: Vec<TargetRay>,
+    backgrounds: Vec<[f32; 3]>,
+    loss: f64,
+    squared: f64,
+    marched: usize,
+    d_sharpness: f32,
+}
+
+/// A NeuS in training.
+pub struct Neus {
+    options: NeusOptions,
+    field: SdfField,
+    outside: RadianceField,
+    outside_parameters: RadianceParameters,
+    /// v, with sharpness s = exp(10 v).
+    sharpness: Parameters,
+    inner_cells: OccupancyGrid,
+    outer_cells: OccupancyGrid,
+    samples_per_ray: Vec<f32>,
+    groups: Vec<Group>,
+    with_masks: bool,
+}
+
+/// Light below which the rest of a ray is dropped.
+const DARK: f32 = 1e-3;
+/// Half width of the logistic density in units of 1 / s: beyond it lies less than a thousandth of the step.
+const REACH: f32 = 7.0;
+/// Random points of the ball in each group, for the eikonal loss alone.
+const FREE_POINTS: usize = 32;
+
+impl Neus {
+    /// A NeuS at its start. Masks are used where the data has them and the options want them.
+    pub fn new(options: NeusOptions, data: &RayDataset) -> Self {
+        let mut rng = rng(options.seed, u64::MAX);
+        let field = SdfField::new(options.field.clone(), &mut rng);
+        let outside = RadianceField::new(&options.background);
+        let mut neus = Self {
+            outside_parameters: outside.init(&mut rng),
+            sharpness: Parameters::new(vec![options.initial_sharpness]),
+            inner_cells: OccupancyGrid::new(options.occupancy),
+            outer_cells: OccupancyGrid::new(options.occupancy),
+            samples_per_ray: vec![64.0],
+            groups: (0..GROUPS).map(|_| Group::default()).collect(),
+            with_masks: options.use_masks && data.has_masks(),
+            field,
+            outside,
+            options,
+        };
+        neus.set_levels(0);
+        neus
+    }
+
+    fn set_levels(&mut self, step: u64) {
+        let more = step / self.options.level_every.max(1);
+        self.field.active_levels = (self.options.first_levels + more as usize).min(self.field.levels());
+    }
+
+    /// Sharpness s of the logistic density, per radius.
+    pub fn sharpness(&self) -> f32 {
+        (10.0 * self.sharpness.values[0]).clamp(-10.0, 12.0).exp()
+    }
+
+    fn anneal(&self, step: u64) -> f32 {
+        if self.options.anneal == 0 { 1.0 } else { (step as f32 / self.options.anneal as f32).min(1.0) }
+    }
+
+    /// Distance from the surface within which a cell of the inner grid counts.
+    fn band(&self) -> f32 {
+        let cell = 2.0 / self.options.occupancy as f32;
+        REACH / self.sharpness() + cell * 3f32.sqrt()
+    }
+
+    fn march(&self, ray: &SceneRay, jitter: f32, tile: &mut Tile) {
+        let o = &self.options;
+        let (before_inner, before_outer) = (tile.inner.len(), tile.outer.len());
+        let ball = ray.ball(1.0);
+        if let Some((near, far)) = ball {
+            let dt = (1.0 / self.sharpness()).clamp(o.shortest_step, o.longest_step);
+            let mut t = near + jitter * dt;
+            while t < far {
+                let p = ray.at(t);
+                if self.inner_cells.is_occupied(p.map(|c| 0.5 * c + 0.5)) {
+                    tile.inner.push(p);
+                    tile.inner_dt.push(dt);
+                }
+                t += dt;
+            }
+        }
+        if !self.with_masks {
+            let start = ball.map_or(0.5, |(_, far)| far);
+            let step = |t: f32| (t * o.background_cone).max(0.02);
+            let mut t = start + jitter * step(start);
+            while t < o.far {
+                let dt = step(t);
+                let u = contract(ray.at(t));
+                if self.outer_cells.is_occupied(u) {
+                    tile.outer.push(u);
+                    tile.outer_dt.push(dt);
+                }
+                t += dt;
+            }
+        }
+        tile.inner_runs.push(((tile.inner.len() - before_inner) as u32, ray.direction));
+        tile.outer_runs.push(((tile.outer.len() - before_outer) as u32, ray.direction));
+    }
+
+    /// Computes everything of a tile: distances, normals, opacities, colours, composites.
+    fn shade(&self, tile: &mut Tile, sdf: &mut SdfWorker, outside: &mut RadianceWorker, backgrounds: &[[f32; 3]], anneal: f32) {
+        let s = self.sharpness();
+        self.field.distance(&tile.inner, sdf);
+        self.drop_dark(tile, sdf, s);
+        self.field.normals(sdf);
+        self.field.color(&tile.inner_runs, sdf);
+        if !self.with_masks {
+            self.outside.density(&self.outside_parameters, &tile.outer, outside);
+            self.outside.color(&self.outside_parameters, &tile.outer_runs, outside);
+        }
+        tile.alphas.clear();
+        tile.rgb.clear();
+        tile.composites.clear();
+        tile.weights.resize(tile.inner.len() + tile.outer.len(), 0.0);
+        let (mut inner, mut outer) = (0, 0);
+        for (ray, background) in backgrounds.iter().enumerate() {
+            let start = tile.alphas.len();
+            let (count, direction) = tile.inner_runs[ray];
+            for i in inner..inner + count as usize {
+                tile.alphas.push(section(sdf, i, tile.inner_dt[i], direction).alpha(s, anneal));
+                tile.rgb.push(sdf.rgb[i]);
+            }
+            inner += count as usize;
+            let count = tile.outer_runs[ray].0 as usize;
+            for i in outer..outer + count {
+                tile.alphas.push(opacity(outside.sigma[i], tile.outer_dt[i]));
+                tile.rgb.push(outside.rgb[i]);
+            }
+            outer += count;
+            let weights = &mut tile.weights[start..tile.alphas.len()];
+            tile.composites.push(composite(&tile.alphas[start..], &tile.rgb[start..], *background, weights));
+        }
+    }
+
+    /// Drops inner samples that no light reaches, judged by the drop of the logistic function between neighbours, which
+    /// needs no normals.
+    fn drop_dark(&self, tile: &mut Tile, sdf: &mut SdfWorker, s: f32) {
+        tile.keep.clear();
+        let mut first = 0;
+        for run in &mut tile.inner_runs {
+            let last = first + run.0 as usize;
+            let mut light = 1.0;
+            let mut kept = 0;
+            for i in first..last {
+                if light < DARK {
+                    break;
+                }
+                tile.keep.push(i as u32);
+                kept += 1;
+                if i + 1 < last {
+                    let (p, q) = (crate::simd::sigmoid(s * sdf.sdf[i]), crate::simd::sigmoid(s * sdf.sdf[i + 1]));
+                    light *= ((q + 1e-5) / (p + 1e-5)).min(1.0);
+                }
+            }
+            run.0 = kept;
+            first = last;
+        }
+        if tile.keep.len() < tile.inner.len() {
+            self.field.compact(&tile.keep, sdf);
+            for (to, from) in tile.keep.iter().enumerate() {
+                tile.inner[to] = tile.inner[*from as usize];
+                tile.inner_dt[to] = tile.inner_dt[*from as usize];
+            }
+            tile.inner.truncate(tile.keep.len());
+            tile.inner_dt.truncate(tile.keep.len());
+        }
+    }
+
+    fn run_group(&self, data: &RayDataset, rng: &mut Rng, rays: usize, step: u64, transposed: &Transposed, group: &mut Group) {
+        let anneal = self.anneal(step);
+        data.draw(rng, rays, &mut group.rays);
+        (group.loss, group.squared, group.marched, group.d_sharpness) = (0.0, 0.0, 0, 0.0);
+        let mut next = 0;
+        while next < group.rays.len() {
+            let first = next;
+            group.tile.clear();
+            group.backgrounds.clear();
+            while next < group.rays.len() && group.tile.inner.len() + group.tile.outer.len() < TILE {
+                let background =
+                    if self.with_masks { [0.0; 3] } else { std::array::from_fn(|_| rng.random()) };
+                group.backgrounds.push(background);
+                self.march(&group.rays[next].ray, rng.random(), &mut group.tile);
+                next += 1;
+            }
+            group.marched += group.tile.inner.len();
+            let Group { sdf, outside, tile, backgrounds, .. } = group;
+            self.shade(tile, sdf, outside, backgrounds, anneal);
+            self.losses(group, first..next, rays);
+            self.send_back(group, anneal, rays);
+            if !self.with_masks {
+                self.outside.backward(&self.outside_parameters, transposed, &group.tile.outer, &mut group.outside);
+            }
+            self.field.backward(&mut group.sdf);
+        }
+        self.free_points(rng, group);
+    }
+
+    /// The loss of each ray, and its derivatives with respect to opacities and colours.
+    fn losses(&self, group: &mut Group, range: std::ops::Range<usize>, rays: usize) {
+        let scale = 1.0 / (rays * GROUPS) as f32;
+        let tile = &mut group.tile;
+        tile.d_alphas.clear();
+        tile.d_alphas.resize(tile.alphas.len(), 0.0);
+        tile.d_rgb.clear();
+        tile.d_rgb.resize(tile.alphas.len(), [0.0; 3]);
+        let mut start = 0;
+        for (i, target) in group.rays[range].iter().enumerate() {
+            let run = start..start + (tile.inner_runs[i].0 + tile.outer_runs[i].0) as usize;
+            start = run.end;
+            let found = &tile.composites[i];
+            let mask = target.mask.filter(|_| self.with_masks);
+            let wanted = target.rgb.map(|c| c * mask.unwrap_or(1.0));
+            let error: [f32; 3] = std::array::from_fn(|c| found.rgb[c] - wanted[c]);
+            group.squared += error.iter().map(|e| f64::from(e * e)).sum::<f64>();
+            group.loss += error.iter().map(|e| f64::from(e.abs())).sum::<f64>() / 3.0;
+            let mut gradient =
+                CompositeGradient { d_rgb: error.map(|e| e.signum() * scale / 3.0), d_transmittance: 0.0 };
+            if let Some(mask) = mask {
+                let cover = (1.0 - found.transmittance).clamp(1e-3, 1.0 - 1e-3);
+                group.loss -= f64::from(self.options.mask * (mask * cover.ln() + (1.0 - mask) * (1.0 - cover).ln()));
+                gradient.d_transmittance =
+                    self.options.mask * scale * (mask / cover - (1.0 - mask) / (1.0 - cover));
+            }
+            composite_backward(
+                &tile.alphas[run.clone()], &tile.rgb[run.clone()], group.backgrounds[i], &tile.weights[run.clone()], found,
+                &gradient, &mut tile.d_alphas[run.clone()], &mut tile.d_rgb[run],
+            );
+        }
+    }
+
+    /// From opacities and colours back to distance, normal, sharpness, density; adds the eikonal loss.
+    fn send_back(&self, group: &mut Group, anneal: f32, rays: usize) {
+        let s = self.sharpness();
+        let Group { sdf, outside, tile, .. } = group;
+        let samples = rays as f32 * GROUPS as f32 * self.samples_per_ray[0].max(1.0);
+        for d in [&mut sdf.d_rgb, &mut sdf.d_normals] {
+            d.clear();
+        }
+        sdf.d_sdf.clear();
+        outside.d_sigma.clear();
+        outside.d_rgb.clear();
+        let (mut at, mut inner, mut outer) = (0, 0, 0);
+        for ray in 0..tile.inner_runs.len() {
+            let (count, direction) = tile.inner_runs[ray];
+            for i in inner..inner + count as usize {
+                let derivative = section(sdf, i, tile.inner_dt[i], direction).gradient(s, anneal);
+                let d_alpha = tile.d_alphas[at];
+                sdf.d_sdf.push(d_alpha * derivative.sdf);
+                group.d_sharpness += d_alpha * derivative.sharpness;
+                let (loss, pull) = eikonal(sdf.normals[i], self.options.eikonal / samples);
+                group.loss += f64::from(loss) * (rays * GROUPS) as f64;
+                sdf.d_normals.push(std::array::from_fn(|d| d_alpha * derivative.cosine * direction[d] + pull[d]));
+                sdf.d_rgb.push(tile.d_rgb[at]);
+                at += 1;
+            }
+            inner += count as usize;
+            let count = tile.outer_runs[ray].0 as usize;
+            for i in outer..outer + count {
+                outside.d_sigma.push(tile.d_alphas[at] * tile.outer_dt[i] * (1.0 - tile.alphas[at]));
+                outside.d_rgb.push(tile.d_rgb[at]);
+                at += 1;
+            }
+            outer += count;
+        }
+    }
+
+    /// The eikonal loss at random points of the ball.
+    fn free_points(&self, rng: &mut Rng, group: &mut Group) {
+        let points: Vec<[f32; 3]> =
+            (0..FREE_POINTS).map(|_| std::array::from_fn(|_| rng.random_range(-1.0..1.0f32))).collect();
+        let sdf = &mut group.sdf;
+        self.field.distance(&points, sdf);
+        self.field.normals(sdf);
+        let weight = self.options.eikonal / (FREE_POINTS * GROUPS) as f32;
+        sdf.d_normals.clear();
+        sdf.d_normals.extend(sdf.normals.iter().map(|n| eikonal(*n, weight).1));
+        sdf.d_sdf.clear();
+        sdf.d_sdf.resize(FREE_POINTS, 0.0);
+        sdf.d_rgb.clear();
+        self.field.backward(sdf);
+    }
+
+    fn refresh_cells(&mut self, turn: u64) {
+        let all = turn < TURNS && (turn + 1).is_power_of_two();
+        let field = &self.field;
+        // The distance is known at once: nothing is remembered. Nearness is 1 / (|f| + 0.001).
+        self.inner_cells.update(self.options.seed ^ 0x696e, turn, all, 0.0, |units, out| {
+            let mut worker = SdfWorker::default();
+            for tile in units.chunks(TILE) {
+                let tile: Vec<[f32; 3]> = tile.iter().map(|u| u.map(|c| 2.0 * c - 1.0)).collect();
+                field.distance(&tile, &mut worker);
+                out.extend(worker.sdf.iter().map(|f| 1.0 / (f.abs() + 1e-3)));
+            }
+        });
+        if !self.with_masks {
+            let (outside, parameters) = (&self.outside, &self.outside_parameters);
+            self.outer_cells.update(self.options.seed ^ 0x6f75, turn, all, 0.95, |units, out| {
+                let mut worker = RadianceWorker::default();
+                for tile in units.chunks(TILE) {
+                    outside.density(parameters, tile, &mut worker);
+                    out.extend_from_slice(&worker.sigma);
+                }
+            });
+        }
+        self.decide();
+    }
+
+    fn decide(&mut self) {
+        self.inner_cells.decide(1.0 / (self.band() + 1e-3));
+        self.outer_cells.decide(self.outer_cells.mean().min(0.5));
+    }
+}
+
+fn section(sdf: &SdfWorker, i: usize, dt: f32, direction: [f32; 3]) -> Section {
+    let n = sdf.normals[i];
+    Section { sdf: sdf.sdf[i], cosine: n[0] * direction[0] + n[1] * direction[1] + n[2] * direction[2], dt }
+}
+
+/// `weight (|n| - 1)^2` and its derivative with respect to n.
+fn eikonal(n: [f32; 3], weight: f32) -> (f32, [f32; 3]) {
+    let norm = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt().max(1e-6);
+    (weight * (norm - 1.0) * (norm - 1.0), n.map(|c| 2.0 * weight * (norm - 1.0) / norm * c))
+}
+
+impl Model for Neus {
+    fn name(&self) -> &'static str {
+        "neus"
+    }
+
+    fn iterations(&self) -> u64 {
+        self.options.iterations
+    }
+
+    fn step(&mut self, data: &RayDataset, step: u64) -> StepReport {
+        self.set_levels(step);
+        let wanted = self.options.samples_per_step as f32 / self.samples_per_ray[0].max(1.0);
+        let rays = (wanted as usize / GROUPS).clamp(8, 128);
+        let transposed = self.outside.transpose(&self.outside_parameters);
+        let mut groups = std::mem::take(&mut self.groups);
+        groups.par_iter_mut().enumerate().for_each(|(i, group)| {
+            let mut rng = rng(self.options.seed, step * GROUPS as u64 + i as u64);
+            self.run_group(data, &mut rng, rays, step, &transposed, group);
+        });
+        self.field.collect(groups.iter_mut().map(|g| &mut g.sdf));
+        if !self.with_masks {
+            self.outside.collect(&mut self.outside_parameters, groups.iter_mut().map(|g| &mut g.outside));
+        }
+        let n = (rays * GROUPS) as f64;
+        let loss = groups.iter().map(|g| g.loss).sum::<f64>() / n;
+        let mse = groups.iter().map(|g| g.squared).sum::<f64>() / (3.0 * n);
+        let samples = groups.iter().map(|g| g.marched).sum::<usize>();
+        // ds/dv = 10 s.
+        self.sharpness.grads[0] = groups.iter().map(|g| g.d_sharpness).sum::<f32>() * 10.0 * self.sharpness();
+        self.groups = groups;
+        let factor = self.options.schedule.factor(step + 1);
+        let adam = AdamOptions { beta2: 0.99, epsilon: 1e-15, ..AdamOptions::default() };
+        let (table, network) = (self.options.table_learning_rate * factor, self.options.learning_rate * factor);
+        self.field.step(&adam, table, network, step + 1);
+        self.sharpness.step(&adam, self.options.sharpness_learning_rate, step + 1);
+        if !self.with_masks {
+            self.outside_parameters.step(table, step + 1);
+        }
+        self.samples_per_ray[0] += 0.1 * (samples as f32 / n as f32 - self.samples_per_ray[0]);
+        if (step + 1).is_multiple_of(self.options.occupancy_every) {
+            self.refresh_cells((step + 1) / self.options.occupancy_every);
+        }
+        StepReport { loss, mse, rays: rays * GROUPS, samples }
+    }
+
+    fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
+        let parts: Vec<Vec<[f32; 3]>> = rays
+            .par_chunks(64)
+            .map(|rays| {
+                let mut group = Group::default();
+                let mut out = Vec::with_capacity(rays.len());
+                let mut first = 0;
+                while first < rays.len() {
+                    group.tile.clear();
+                    let mut next = first;
+                    while next < rays.len() && group.tile.inner.len() + group.tile.outer.len() < TILE {
+                        self.march(&rays[next], 0.5, &mut group.tile);
+                        next += 1;
+                    }
+                    let black = vec![[0.0; 3]; next - first];
+                    self.shade(&mut group.tile, &mut group.sdf, &mut group.outside, &black, 1.0);
+                    out.extend(group.tile.composites.iter().map(|c| c.rgb));
+                    first = next;
+                }
+                out
+            })
+            .collect();
+        parts.concat()
+    }
+
+    fn level(&self) -> Level {
+        Level { value: 0.0, larger_inside: false }
+    }
+
+    fn surface(&self, positions: &[[f32; 3]]) -> Vec<f32> {
+        let mut worker = SdfWorker::default();
+        let mut out = Vec::with_capacity(positions.len());
+        for tile in positions.chunks(TILE) {
+            self.field.distance(tile, &mut worker);
+            out.extend_from_slice(&worker.sdf);
+        }
+        out
+    }
+
+    fn buffers(&mut self) -> Vec<&mut Vec<f32>> {
+        let mut all = self.field.buffers();
+        all.extend(self.outside_parameters.buffers());
+        all.extend([&mut self.sharpness.values, &mut self.sharpness.m, &mut self.sharpness.v]);
+        all.extend([&mut self.inner_cells.values, &mut self.outer_cells.values, &mut self.samples_per_ray]);
+        all
+    }
+
+    fn restored(&mut self, step: u64) {
+        self.field.refresh();
+        self.set_levels(step);
+        if step >= self.options.occupancy_every {
+            self.decide();
+        }
+    }
+
+    fn is_finite(&self) -> bool {
+        self.field.is_finite() && self.outside_parameters.is_finite() && self.sharpness.is_finite()
+    }
+
+    fn parameter_count(&self) -> usize {
+        let outside = if self.with_masks { 0 } else { self.outside.parameter_count() };
+        self.field.parameter_count() + outside + 1
+    }
+}
