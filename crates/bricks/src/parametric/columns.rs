@@ -101,7 +101,17 @@ pub(crate) struct Columns {
 struct Operation {
     /// Loops, inside by the even-odd rule.
     loops: Vec<Outline>,
+    /// The rectangle around them.
+    min: [f64; 2],
+    max: [f64; 2],
     change: Change,
+}
+
+impl Operation {
+    fn reaches(&self, at: [f64; 2]) -> bool {
+        (0..2).all(|axis| self.min[axis] < at[axis] && at[axis] < self.max[axis])
+            && self.loops.iter().filter(|outline| contains(outline, at)).count() % 2 == 1
+    }
 }
 
 /// What happens over the outline.
@@ -155,7 +165,14 @@ impl Columns {
         // On a binary grid, sums and differences of coordinates are exact.
         let snap = |v: &mut f64| *v = (*v * 1_048_576.0).round() / 1_048_576.0;
         loops.iter_mut().flatten().flatten().for_each(snap);
-        self.operations.push(Operation { loops, change });
+        let (mut min, mut max) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+        for corner in loops.iter().flatten() {
+            for axis in 0..2 {
+                min[axis] = min[axis].min(corner[axis]);
+                max[axis] = max[axis].max(corner[axis]);
+            }
+        }
+        self.operations.push(Operation { loops, min, max, change });
         self
     }
 
@@ -183,11 +200,8 @@ impl Columns {
     /// The filled intervals over a point of the ground, from top to bottom.
     fn stack(&self, at: [f64; 2]) -> Vec<[Plane; 2]> {
         let mut stack: Vec<[Plane; 2]> = vec![];
-        for operation in &self.operations {
-            let inside = operation.loops.iter().filter(|outline| contains(outline, at)).count() % 2 == 1;
-            if inside {
-                stack = changed(stack, operation.change, at);
-            }
+        for operation in self.operations.iter().filter(|operation| operation.reaches(at)) {
+            stack = changed(stack, operation.change, at);
         }
         stack
     }
