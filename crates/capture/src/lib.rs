@@ -6,6 +6,7 @@
 
 mod alignment;
 mod colmap_model;
+mod export;
 mod import;
 mod keypoints;
 mod lens;
@@ -17,6 +18,7 @@ mod sequence;
 mod visibility;
 
 pub use alignment::{Alignment, AlignmentStage, FrameAlignment};
+pub use export::{ExportFormat, ExportSummary, export};
 pub use import::{CaptureFormat, ImportOptions, ImportSummary, SkippedFrame, import};
 pub use keypoints::{Keypoint, Keypoints};
 pub use lens::{Distortion, Lens};

@@ -1,8 +1,8 @@
-//! A reader of pickles that hold numbers, text and numpy arrays, and nothing else.
+//! A reader of pickles that hold numbers, text, numpy arrays and torch tensors, and nothing else.
 //!
 //! A pickle is a program for a small stack machine, and Python's own reader lets it call any function. This one knows
-//! the six callables with which numpy writes arrays, dtypes and scalars, builds plain data from them, and refuses
-//! everything else. Protocols 0 to 5 (Python's `Lib/pickletools.py` documents the operations).
+//! the callables with which numpy writes arrays, dtypes and scalars and torch writes tensors, builds plain data from
+//! them, and refuses everything else. Protocols 0 to 5 (Python's `Lib/pickletools.py` documents the operations).
 //!
 //! Values live in one arena and refer to each other by index: sharing costs nothing, hostile nesting cannot overflow the
 //! stack, and memory is bounded by [`MAX_OPERATIONS`] and the size of the input.
@@ -15,11 +15,11 @@ use machine::Machine;
 const MAX_OPERATIONS: usize = 1 << 20;
 
 /// Index of a value in [`Pickle::values`].
-pub(crate) type Id = usize;
+pub type Id = usize;
 
 /// What a pickle can hold here.
 #[derive(Debug, Clone)]
-pub(crate) enum Value {
+pub enum Value {
     None,
     Bool(bool),
     Int(i64),
@@ -32,11 +32,14 @@ pub(crate) enum Value {
     Callable(Callable),
     Dtype(Dtype),
     Array(Array),
+    Tensor(Tensor),
+    /// A reference to something outside the pickle: for torch the tuple `('storage', type, key, place, count, ...)`.
+    Persistent(Id),
 }
 
 /// What a pickle may call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Callable {
+pub enum Callable {
     /// `numpy.core.multiarray._reconstruct(ndarray, shape, type)`: an array without content, which `BUILD` fills.
     Reconstruct,
     /// `numpy.core.multiarray.scalar(dtype, bytes)`.
@@ -51,11 +54,40 @@ pub(crate) enum Callable {
     Encode,
     /// `bytes()`, how protocols 0 to 2 write no bytes.
     EmptyBytes,
+    /// `collections.OrderedDict()`, read as a plain dictionary.
+    OrderedDict,
+    /// `torch._utils._rebuild_tensor_v2(storage, offset, shape, stride, ...)` and its older form.
+    RebuildTensor,
+    /// `torch._utils._rebuild_parameter(tensor, ...)`, read as the tensor.
+    RebuildParameter,
+    /// `torch.FloatStorage` and its like, only inside a reference.
+    Storage(StorageType),
+}
+
+/// The numbers in a torch storage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StorageType {
+    F16,
+    BF16,
+    F32,
+    F64,
+    /// Integers, which no weights are.
+    Other,
+}
+
+/// A torch tensor: a view of a storage that lies outside the pickle. Numbers are counted in elements.
+#[derive(Debug, Clone)]
+pub struct Tensor {
+    /// A [`Value::Persistent`].
+    pub storage: Id,
+    pub offset: usize,
+    pub shape: Vec<usize>,
+    pub stride: Vec<usize>,
 }
 
 /// An element type: kind and width.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Dtype {
+pub struct Dtype {
     /// numpy's letter: `b` bool, `i`, `u`, `f`, `O`.
     pub kind: u8,
     /// Bytes per element.
@@ -65,7 +97,7 @@ pub(crate) struct Dtype {
 
 /// The content of a numpy array.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Array {
+pub struct Array {
     pub shape: Vec<usize>,
     pub fortran_order: bool,
     pub dtype: Option<Dtype>,
@@ -75,27 +107,38 @@ pub(crate) struct Array {
 
 /// What was wrong, and at which byte of the pickle.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Fault {
+pub struct Fault {
     pub byte: usize,
     pub found: String,
 }
 
 /// A pickle's values.
 #[derive(Debug)]
-pub(crate) struct Pickle {
+pub struct Pickle {
     values: Vec<Value>,
     root: Id,
 }
 
 impl Pickle {
     /// Reads a pickle, up to its `STOP`.
+    ///
+    /// # Errors
+    /// The bytes end early or are no pickle, or the pickle wants to call something else than it may.
     pub fn read(bytes: &[u8]) -> Result<Self, Fault> {
+        Ok(Self::read_prefix(bytes)?.0)
+    }
+
+    /// Like [`Self::read`], with the number of bytes up to and with `STOP`, behind which another pickle may follow.
+    ///
+    /// # Errors
+    /// As for [`Self::read`].
+    pub fn read_prefix(bytes: &[u8]) -> Result<(Self, usize), Fault> {
         let mut machine = Machine::new(bytes);
         for _ in 0..MAX_OPERATIONS {
             let start = machine.at;
             match machine.step() {
                 Ok(None) => {}
-                Ok(Some(root)) => return Ok(Self { values: machine.values, root }),
+                Ok(Some(root)) => return Ok((Self { values: machine.values, root }, machine.at)),
                 Err(found) => return Err(Fault { byte: start, found }),
             }
         }

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use super::{Array, Callable, Dtype, Id, Value};
+use super::{Array, Callable, Dtype, Id, StorageType, Tensor, Value};
 
 /// The stack machine.
 pub(super) struct Machine<'a> {
@@ -187,6 +187,10 @@ impl<'a> Machine<'a> {
                 let state = self.pop()?;
                 self.build(state)?;
             }
+            b'Q' => {
+                let reference = self.pop()?;
+                self.push(Value::Persistent(reference));
+            }
             other => return Err(format!("operation 0x{other:02x}, which no array needs")),
         }
         Ok(None)
@@ -359,7 +363,22 @@ impl<'a> Machine<'a> {
                 _ => Err(refused()),
             },
             Callable::EmptyBytes if arguments.is_empty() => Ok(Value::Bytes(Vec::new())),
-            Callable::EmptyBytes | Callable::NdArray => Err(refused()),
+            Callable::OrderedDict if arguments.is_empty() => Ok(Value::Dict(Vec::new())),
+            Callable::RebuildTensor => match (arguments.first(), argument(1), argument(2), argument(3)) {
+                (Some(&storage), Some(&Value::Int(offset)), Some(shape), Some(stride))
+                    if matches!(self.values[storage], Value::Persistent(_)) =>
+                {
+                    let offset = usize::try_from(offset).map_err(|_| refused())?;
+                    let (shape, stride) = (self.shape(shape)?, self.shape(stride)?);
+                    Ok(Value::Tensor(Tensor { storage, offset, shape, stride }))
+                }
+                _ => Err(refused()),
+            },
+            Callable::RebuildParameter => match argument(0) {
+                Some(Value::Tensor(tensor)) => Ok(Value::Tensor(tensor.clone())),
+                _ => Err(refused()),
+            },
+            Callable::EmptyBytes | Callable::NdArray | Callable::OrderedDict | Callable::Storage(_) => Err(refused()),
         }
     }
 
@@ -375,6 +394,10 @@ impl<'a> Machine<'a> {
     /// Gives the value on top of the stack its state.
     fn build(&mut self, state: Id) -> Step<()> {
         let top = self.top()?;
+        // torch hangs version numbers on the dictionary of a module's weights; they are of no use here.
+        if matches!((&self.values[top], &self.values[state]), (Value::Dict(_), Value::Dict(_))) {
+            return Ok(());
+        }
         let Value::Items(state) = &self.values[state] else { return Err("a state that is no tuple".to_owned()) };
         match &self.values[top] {
             // (version, byte order, ...)
@@ -415,6 +438,16 @@ fn callable(module: &str, name: &str) -> Step<Callable> {
         ("numpy", "ndarray") => Callable::NdArray,
         ("_codecs", "encode") => Callable::Encode,
         ("builtins" | "__builtin__", "bytes") => Callable::EmptyBytes,
+        ("collections", "OrderedDict") => Callable::OrderedDict,
+        ("torch._utils", "_rebuild_tensor" | "_rebuild_tensor_v2") => Callable::RebuildTensor,
+        ("torch._utils", "_rebuild_parameter") => Callable::RebuildParameter,
+        ("torch", name) if name.ends_with("Storage") => Callable::Storage(match name {
+            "HalfStorage" => StorageType::F16,
+            "BFloat16Storage" => StorageType::BF16,
+            "FloatStorage" => StorageType::F32,
+            "DoubleStorage" => StorageType::F64,
+            _ => StorageType::Other,
+        }),
         _ => return Err(format!("a call of {module}.{name}, which is never made")),
     })
 }
