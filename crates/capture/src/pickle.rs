@@ -20,18 +20,29 @@ pub type Id = usize;
 /// What a pickle can hold here.
 #[derive(Debug, Clone)]
 pub enum Value {
+    /// `None`.
     None,
+    /// A truth value.
     Bool(bool),
+    /// An integer of up to 64 bits.
     Int(i64),
+    /// A number.
     Float(f64),
+    /// A `str`.
     Text(String),
+    /// A `bytes`, or a `str` of Python 2.
     Bytes(Vec<u8>),
     /// Lists and tuples.
     Items(Vec<Id>),
+    /// Keys and values, in the order of insertion.
     Dict(Vec<(Id, Id)>),
+    /// A function or class that was named, not called.
     Callable(Callable),
+    /// A numpy element type.
     Dtype(Dtype),
+    /// A numpy array or scalar.
     Array(Array),
+    /// A torch tensor.
     Tensor(Tensor),
     /// A reference to something outside the pickle: for torch the tuple `('storage', type, key, place, count, ...)`.
     Persistent(Id),
@@ -67,9 +78,13 @@ pub enum Callable {
 /// The numbers in a torch storage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StorageType {
+    /// Half precision.
     F16,
+    /// The upper half of single precision.
     BF16,
+    /// Single precision.
     F32,
+    /// Double precision.
     F64,
     /// Integers, which no weights are.
     Other,
@@ -80,8 +95,11 @@ pub enum StorageType {
 pub struct Tensor {
     /// A [`Value::Persistent`].
     pub storage: Id,
+    /// Where the first element lies in the storage.
     pub offset: usize,
+    /// Size along each axis.
     pub shape: Vec<usize>,
+    /// Elements between neighbours along each axis.
     pub stride: Vec<usize>,
 }
 
@@ -92,14 +110,18 @@ pub struct Dtype {
     pub kind: u8,
     /// Bytes per element.
     pub size: usize,
+    /// Byte order of the elements.
     pub big_endian: bool,
 }
 
 /// The content of a numpy array.
 #[derive(Debug, Clone, Default)]
 pub struct Array {
+    /// Size along each axis.
     pub shape: Vec<usize>,
+    /// Whether the first index runs fastest.
     pub fortran_order: bool,
+    /// Type of the elements; `None` until `BUILD`.
     pub dtype: Option<Dtype>,
     /// The elements' bytes (a [`Value::Bytes`]), or for objects the list of them; `None` until `BUILD`.
     pub content: Option<Id>,
@@ -108,7 +130,9 @@ pub struct Array {
 /// What was wrong, and at which byte of the pickle.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Fault {
+    /// Where, from 0.
     pub byte: usize,
+    /// What was found, as a clause.
     pub found: String,
 }
 
