@@ -24,10 +24,33 @@ fn is_depth(z: f32) -> bool {
     z > 0.0 && z.is_finite()
 }
 
+/// Pixels along each side of a tile of [`FarthestDepth`].
+const TILE: usize = 16;
+
+/// The largest depth in each tile of a depth map, 0 where a tile has no depth.
+struct FarthestDepth {
+    columns: usize,
+    tiles: Vec<f32>,
+}
+
+impl FarthestDepth {
+    fn of(depth: &DepthImage) -> Self {
+        let columns = depth.width().div_ceil(TILE);
+        let mut tiles = vec![0.0; columns * depth.height().div_ceil(TILE)];
+        for (y, row) in depth.data().chunks_exact(depth.width().max(1)).enumerate() {
+            let tiles = &mut tiles[y / TILE * columns..][..columns];
+            for (tile, pixels) in tiles.iter_mut().zip(row.chunks(TILE)) {
+                *tile = pixels.iter().fold(*tile, |most, &z| if z > most { z } else { most });
+            }
+        }
+        Self { columns, tiles }
+    }
+}
+
 /// The blocks that hold any point within `truncation_m` (along z) of what the depth map shows, in ascending order.
 ///
-/// Pixels are visited at a stride whose footprint is at most one voxel, and each stands for its surroundings: the
-/// stretch of its ray is grown sideways by more than the distance to the next visited pixel.
+/// Pixels are visited at a stride whose footprint is at most one voxel, and each stands for those up to the next: the
+/// stretch of its ray is grown sideways by the stride.
 pub(crate) fn touched_blocks(
     view: &FrameView,
     voxel_size_m: f64,
@@ -37,17 +60,15 @@ pub(crate) fn touched_blocks(
     let size = view.depth.size();
     let world_from_cam = view.cam_from_world.inverse();
     let focal = view.intrinsics.fx.min(view.intrinsics.fy);
-    let farthest = view.depth.data().iter().copied().filter(|&z| is_depth(z)).fold(0.0, f32::max);
-    if farthest == 0.0 {
-        return Ok(Vec::new());
-    }
-    let stride = ((voxel_size_m * focal / f64::from(farthest)) as usize).clamp(1, SIDE);
+    let farthest = FarthestDepth::of(view.depth);
+    let farthest_of_all = farthest.tiles.iter().copied().filter(|&z| is_depth(z)).fold(0.0, f32::max);
+    let stride = ((voxel_size_m * focal / f64::from(farthest_of_all)) as usize).clamp(1, SIDE);
     let block_size = voxel_size_m * SIDE as f64;
 
-    let rows: Vec<usize> = (0..size.height).step_by(stride).collect();
     let mark_row = |&y: &usize| -> Result<Vec<[i32; 3]>> {
         let mut found = Vec::new();
-        let mut last = None;
+        // The block ranges that the pieces of the previous ray touched: neighbouring rays mostly touch the same.
+        let mut previous = Vec::new();
         for x in (0..size.width).step_by(stride) {
             let z = view.depth[(x, y)];
             if !is_depth(z) {
@@ -57,13 +78,14 @@ pub(crate) fn touched_blocks(
             let ray = view.intrinsics.ray(&Point2::new(x as f64, y as f64), &world_from_cam);
             let near = (z - truncation_m).max(0.0);
             let far = z + truncation_m;
-            let pieces = ((far - near) * ray.direction.norm() / (0.5 * block_size)).ceil().max(1.0);
-            let margin = 0.5 * stride as f64 * z / focal + 0.5 * voxel_size_m;
+            let pieces = ((far - near) * ray.direction.norm() / (0.5 * block_size)).ceil().max(1.0) as usize;
+            let margin = stride as f64 * z / focal;
+            previous.resize(pieces, None);
             let mut start = ray.at(near);
-            for i in 1..=pieces as usize {
-                let end = ray.at(near + (far - near) * i as f64 / pieces);
-                let lowest = (start.inf(&end).coords.add_scalar(-margin) / block_size).map(f64::floor);
-                let highest = (start.sup(&end).coords.add_scalar(margin) / block_size).map(f64::floor);
+            for (i, previous) in previous.iter_mut().enumerate() {
+                let end = ray.at(near + (far - near) * (i + 1) as f64 / pieces as f64);
+                let lowest = start.inf(&end).coords.add_scalar(-margin) / block_size;
+                let highest = start.sup(&end).coords.add_scalar(margin) / block_size;
                 if !(lowest.min() > -MAX_BLOCK_COORD && highest.max() < MAX_BLOCK_COORD) {
                     return Err(Error::Failed(format!(
                         "a surface lies {:.0} m from the origin, too far for voxels of {} mm; check the unit of the poses",
@@ -72,12 +94,11 @@ pub(crate) fn touched_blocks(
                     )));
                 }
                 start = end;
-                let range = (lowest.map(|c| c as i32), highest.map(|c| c as i32));
-                // Neighbouring pixels mostly see the same blocks.
-                if last == Some(range) {
+                let range = (lowest.map(floor), highest.map(floor));
+                if *previous == Some(range) {
                     continue;
                 }
-                last = Some(range);
+                *previous = Some(range);
                 let (low, high) = range;
                 // A depth map whose pixels are many blocks wide cannot be fused at this voxel size.
                 let count = (0..3).map(|a| (high[a] - low[a] + 1) as f64).product::<f64>();
@@ -100,6 +121,7 @@ pub(crate) fn touched_blocks(
         Ok(found)
     };
     // Rows are merged in batches, so that memory stays bounded for depth maps that touch far too much.
+    let rows: Vec<usize> = (0..size.height).step_by(stride).collect();
     let mut touched: Vec<[i32; 3]> = Vec::new();
     for batch in rows.chunks(64) {
         let found: Vec<Vec<[i32; 3]>> = batch.par_iter().map(mark_row).collect::<Result<_>>()?;
@@ -113,6 +135,12 @@ pub(crate) fn touched_blocks(
     Ok(touched)
 }
 
+/// The largest integer not above `x`, for `x` within [`MAX_BLOCK_COORD`]; the library's is a call on older processors.
+fn floor(x: f64) -> i32 {
+    let cut = x as i32;
+    cut - i32::from(f64::from(cut) > x)
+}
+
 impl<'a> FrameView<'a> {
     /// Everything about the frame that a block's update needs, in single precision.
     pub fn updater(&self, voxel_size_m: f64, truncation_m: f64) -> BlockUpdater<'a> {
@@ -123,6 +151,7 @@ impl<'a> FrameView<'a> {
         });
         BlockUpdater {
             depth: self.depth,
+            farthest: FarthestDepth::of(self.depth),
             color,
             focal: [self.intrinsics.fx as f32, self.intrinsics.fy as f32],
             center: [self.intrinsics.cx as f32, self.intrinsics.cy as f32],
@@ -137,6 +166,7 @@ impl<'a> FrameView<'a> {
 /// Averages one frame into blocks.
 pub(crate) struct BlockUpdater<'a> {
     depth: &'a DepthImage,
+    farthest: FarthestDepth,
     /// The photograph, and its pixels per depth pixel.
     color: Option<(&'a RgbImage, [f32; 2])>,
     focal: [f32; 2],
@@ -159,44 +189,55 @@ impl BlockUpdater<'_> {
         let (dx, dy, dz) = (self.steps.column(0), self.steps.column(1), self.steps.column(2));
         for row in 0..VOXELS / SIDE {
             let start = corner + dy * (row % SIDE) as f32 + dz * (row / SIDE) as f32;
-            for x in 0..SIDE {
-                let p = start + dx * x as f32;
-                self.update_voxel(block, row * SIDE + x, &p);
+            // Project the whole row first: plain arithmetic on eight numbers, which the compiler does at once.
+            let z: [f32; SIDE] = std::array::from_fn(|i| start.z + dx[2] * i as f32);
+            let u: [f32; SIDE] =
+                std::array::from_fn(|i| self.focal[0] * (start.x + dx[0] * i as f32) / z[i] + self.center[0]);
+            let v: [f32; SIDE] =
+                std::array::from_fn(|i| self.focal[1] * (start.y + dx[1] * i as f32) / z[i] + self.center[1]);
+            for i in 0..SIDE {
+                if z[i] > 0.0 {
+                    self.update_voxel(block, row * SIDE + i, z[i], u[i], v[i]);
+                }
             }
         }
     }
 
-    /// Whether a block whose first voxel is at `corner` (camera frame) can project into the image.
+    /// Whether this frame can change a block whose first voxel is at `corner` (camera frame): some voxel projects into
+    /// the image, where some depth is not nearer than the block by more than the truncation.
     fn may_see(&self, corner: &Vector3<f32>) -> bool {
         let half = (SIDE - 1) as f32 / 2.0;
         let center = corner + self.steps * Vector3::repeat(half);
         let radius = half * 3f32.sqrt() * self.voxel_size_m as f32;
-        if center.z + radius <= 0.0 {
-            return false;
+        let nearest = center.z - radius;
+        if nearest <= 0.0 {
+            // The camera is inside the ball around the block, or behind it.
+            return center.z + radius > 0.0;
         }
-        // Distance of the centre from each side of the view's pyramid, inside positive.
+        // A ball's image lies within its extent divided by its least depth.
         let size = self.depth.size();
-        let inside = |focal: f32, middle: f32, pixels: usize, across: f32| {
-            let low = (middle + 0.5) / focal;
-            let high = (pixels as f32 - 0.5 - middle) / focal;
-            let from_low = (across + low * center.z) / (1.0 + low * low).sqrt();
-            let from_high = (high * center.z - across) / (1.0 + high * high).sqrt();
-            from_low >= -radius && from_high >= -radius
+        let pixels = |axis: usize, count: usize| {
+            let middle = self.focal[axis] * center[axis] / center.z + self.center[axis];
+            let tangent = (center[axis] / center.z).abs();
+            let reach = self.focal[axis] * radius * (1.0 + tangent) / nearest + 1.0;
+            let (low, high) = (middle - reach, middle + reach);
+            (high >= 0.0 && low <= count as f32).then(|| (low.max(0.0) as usize, (high as usize).min(count - 1)))
         };
-        inside(self.focal[0], self.center[0], size.width, center.x)
-            && inside(self.focal[1], self.center[1], size.height, center.y)
+        let (Some((left, right)), Some((top, bottom))) = (pixels(0, size.width), pixels(1, size.height)) else {
+            return false;
+        };
+        let hidden_beyond = nearest - self.truncation_m;
+        (top / TILE..=bottom / TILE).any(|row| {
+            let tiles = &self.farthest.tiles[row * self.farthest.columns..][left / TILE..=right / TILE];
+            tiles.iter().any(|&z| z > 0.0 && z >= hidden_beyond)
+        })
     }
 
+    /// Averages what the frame shows at image position (`u`, `v`) into a voxel at depth `voxel_z`.
     #[inline(always)]
-    fn update_voxel(&self, block: &mut Block, voxel: usize, p_in_cam: &Vector3<f32>) {
-        if p_in_cam.z <= 0.0 {
-            return;
-        }
-        let per_z = 1.0 / p_in_cam.z;
-        let u = self.focal[0] * p_in_cam.x * per_z + self.center[0];
-        let v = self.focal[1] * p_in_cam.y * per_z + self.center[1];
+    fn update_voxel(&self, block: &mut Block, voxel: usize, voxel_z: f32, u: f32, v: f32) {
         let Some(z) = self.depth_at(u, v) else { return };
-        let ahead = z - p_in_cam.z;
+        let ahead = z - voxel_z;
         if ahead < -self.truncation_m {
             return;
         }
