@@ -19,7 +19,8 @@ fn main() {
     for (batch, steps) in [(65_536usize, 30u64), (4_096, 300)] {
         let mut rng = mb_job::rng(0, 0);
         let x: Vec<f32> = (0..batch * 32).map(|_| rng.random_range(-1.0..1.0)).collect();
-        let target: Vec<f32> = (0..batch * 16).map(|i| (x[i / 16 * 32] * x[i / 16 * 32 + 1] + i as f32).sin()).collect();
+        let target: Vec<f32> =
+            (0..batch * 16).map(|i| (x[i / 16 * 32] * x[i / 16 * 32 + 1] + i as f32).sin()).collect();
         let mut parameters = Parameters::new(mlp.init_uniform(&mut rng));
         let mut workers: Vec<(Vec<f32>, MlpCache, Vec<f32>, f64)> =
             (0..GROUPS).map(|_| (vec![0.0; mlp.buffer_len()], MlpCache::default(), Vec::new(), 0.0)).collect();

@@ -24,11 +24,7 @@ fn main() {
     let data = RayDataset::open(&sequence, &data, &Silent).expect("photographs");
     println!("{} views, region {:?}", data.views().len(), data.region());
     let mut model: Box<dyn Model> = match method.as_str() {
-        "nerf" => Box::new(Nerf::new(NerfOptions {
-            iterations: steps,
-            schedule: mb_neural::adam::Schedule::WarmExponential { warm_up: 100, end: steps, floor: 0.03 },
-            ..NerfOptions::default()
-        })),
+        "nerf" => Box::new(Nerf::new(NerfOptions::default().with_iterations(steps))),
         "neus" => Box::new(Neus::new(NeusOptions::default().with_iterations(steps), &data)),
         other => panic!("no method {other}"),
     };

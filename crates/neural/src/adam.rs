@@ -57,7 +57,11 @@ impl Parameters {
         let correction1 = (1.0 - f64::from(options.beta1).powf(t)) as f32;
         let correction2 = (1.0 - f64::from(options.beta2).powf(t)) as f32;
         let constants = [
-            options.beta1, options.beta2, lr / correction1, 1.0 / correction2.sqrt(), options.epsilon,
+            options.beta1,
+            options.beta2,
+            lr / correction1,
+            1.0 / correction2.sqrt(),
+            options.epsilon,
             f32::from(options.skip_untouched),
         ];
         (self.values.par_chunks_mut(PIECE), self.grads.par_chunks_mut(PIECE))

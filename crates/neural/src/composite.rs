@@ -90,7 +90,9 @@ mod tests {
             let alphas = vec![opacity(2.0, 1.5 / n as f32); n];
             let mut weights = vec![0.0; n];
             let c = composite(&alphas, &vec![[1.0; 3]; n], [0.0; 3], &mut weights);
-            assert!((c.rgb[0] - (1.0 - (-3.0f32).exp())).abs() < 1e-5 && (c.transmittance - (-3.0f32).exp()).abs() < 1e-5);
+            assert!(
+                (c.rgb[0] - (1.0 - (-3.0f32).exp())).abs() < 1e-5 && (c.transmittance - (-3.0f32).exp()).abs() < 1e-5
+            );
             assert!((weights.iter().sum::<f32>() + c.transmittance - 1.0).abs() < 1e-5);
         }
     }

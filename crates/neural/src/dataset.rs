@@ -252,6 +252,7 @@ impl RayDataset {
         };
         for view in &self.views {
             add(&view.frame.0.to_le_bytes());
+            add(&[u8::from(view.held_out), u8::from(view.mask.is_some())]);
             let k = &view.intrinsics;
             let pose = view.world_from_cam.to_matrix();
             [k.fx, k.fy, k.cx, k.cy].iter().chain(pose.iter()).for_each(|v| add(&v.to_le_bytes()));

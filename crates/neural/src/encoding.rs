@@ -110,7 +110,11 @@ mod tests {
             unit[0][d] = 1.0;
             let mut tangent = vec![0.0; stride];
             encoding.tangent(&e, &unit, &mut tangent, stride, 2);
-            let at = |h: f32| { let mut p = p; p[d] += h; encode(p) };
+            let at = |h: f32| {
+                let mut p = p;
+                p[d] += h;
+                encode(p)
+            };
             let (above, below) = (at(1e-3), at(-1e-3));
             let mut dot = 0.0;
             for i in 2..2 + encoding.width() {
@@ -134,8 +138,8 @@ mod tests {
             let h = spherical_harmonics([(r * cos) as f32, (r * sin) as f32, z as f32]);
             for a in 0..HARMONICS {
                 for b in 0..HARMONICS {
-                    product[a][b] += f64::from(h[a]) * f64::from(h[b]) * 4.0 * std::f64::consts::PI
-                        / (rings * around) as f64;
+                    product[a][b] +=
+                        f64::from(h[a]) * f64::from(h[b]) * 4.0 * std::f64::consts::PI / (rings * around) as f64;
                 }
             }
         }

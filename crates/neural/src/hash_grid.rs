@@ -110,9 +110,7 @@ impl Level {
         let corners = if self.dense {
             let side = self.cells + 1;
             let first = (base[2] * side + base[1]) * side + base[0];
-            std::array::from_fn(|c| {
-                first + (c as u32 & 1) + (c as u32 >> 1 & 1) * side + (c as u32 >> 2) * side * side
-            })
+            std::array::from_fn(|c| first + (c as u32 & 1) + (c as u32 >> 1 & 1) * side + (c as u32 >> 2) * side * side)
         } else {
             let mask = self.entries - 1;
             let x = [base[0], base[0] + 1];
@@ -151,7 +149,10 @@ impl HashGrid {
     /// A size is zero or beyond sense: features other than 1, 2, 4, 8; more than 2^28 entries; cells not rising.
     pub fn new(options: HashGridOptions) -> Self {
         assert!(matches!(options.features, 1 | 2 | 4 | 8) && options.levels > 0, "{options:?}");
-        assert!(options.log2_entries <= 28 && 0 < options.coarsest && options.coarsest <= options.finest, "{options:?}");
+        assert!(
+            options.log2_entries <= 28 && 0 < options.coarsest && options.coarsest <= options.finest,
+            "{options:?}"
+        );
         let growth = if options.levels > 1 {
             (options.finest as f64 / options.coarsest as f64).powf(1.0 / (options.levels - 1) as f64)
         } else {
@@ -206,7 +207,15 @@ impl HashGrid {
 
     /// Writes the features of `positions` to `out`: `[samples, stride]`, from column `first`. Levels from `active` on
     /// give zeros.
-    pub fn forward(&self, table: &[f32], positions: &[[f32; 3]], active: usize, out: &mut [f32], stride: usize, first: usize) {
+    pub fn forward(
+        &self,
+        table: &[f32],
+        positions: &[[f32; 3]],
+        active: usize,
+        out: &mut [f32],
+        stride: usize,
+        first: usize,
+    ) {
         with_features!(self, forward_f(table, positions, active, out, stride, first));
     }
 
@@ -394,9 +403,8 @@ mod tests {
 
     /// Positions away from cell walls, where the encoding has a kink.
     fn positions(rng: &mut mb_job::Rng) -> Vec<[f32; 3]> {
-        let away = |p: &[f32; 3]| {
-            (0..3).all(|l| p.iter().all(|v| ((v * grid(2).cells(l) as f32).fract() - 0.5).abs() < 0.45))
-        };
+        let away =
+            |p: &[f32; 3]| (0..3).all(|l| p.iter().all(|v| ((v * grid(2).cells(l) as f32).fract() - 0.5).abs() < 0.45));
         std::iter::repeat_with(|| std::array::from_fn(|_| rng.random_range(0.0..1.0f32))).filter(away).take(9).collect()
     }
 
@@ -408,15 +416,22 @@ mod tests {
             grid.forward(table, &[*x], 3, &mut e, width, 0);
             e.iter().zip(with).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>()
         };
-        x.iter().enumerate().map(|(s, x)| {
-            let rows = s * width..(s + 1) * width;
-            let mut sum = dot(x, &d_e[rows.clone()]);
-            for d in 0..3 {
-                let at = |h: f32| { let mut y = *x; y[d] += h; dot(&y, &g[rows.clone()]) };
-                sum += f64::from(d_n[s][d]) * (at(2e-3) - at(-2e-3)) / 4e-3;
-            }
-            sum
-        }).sum()
+        x.iter()
+            .enumerate()
+            .map(|(s, x)| {
+                let rows = s * width..(s + 1) * width;
+                let mut sum = dot(x, &d_e[rows.clone()]);
+                for d in 0..3 {
+                    let at = |h: f32| {
+                        let mut y = *x;
+                        y[d] += h;
+                        dot(&y, &g[rows.clone()])
+                    };
+                    sum += f64::from(d_n[s][d]) * (at(2e-3) - at(-2e-3)) / 4e-3;
+                }
+                sum
+            })
+            .sum()
     }
 
     #[test]
@@ -450,12 +465,20 @@ mod tests {
             }
             // The loss is linear in the table and in g, so any step is exact.
             for i in (0..grid.len()).step_by(5) {
-                let at = |h: f32| { let mut t = table.clone(); t[i] += h; loss(&grid, &t, &x, &g, &d_e, &d_n) };
+                let at = |h: f32| {
+                    let mut t = table.clone();
+                    t[i] += h;
+                    loss(&grid, &t, &x, &g, &d_e, &d_n)
+                };
                 let expected = at(0.5) - at(-0.5);
                 assert!((f64::from(grads[i]) - expected).abs() < 5e-3, "{i}: {} is not {expected}", grads[i]);
             }
             for i in 0..d_g.len() {
-                let at = |h: f32| { let mut g = g.clone(); g[i] += h; loss(&grid, &table, &x, &g, &d_e, &d_n) };
+                let at = |h: f32| {
+                    let mut g = g.clone();
+                    g[i] += h;
+                    loss(&grid, &table, &x, &g, &d_e, &d_n)
+                };
                 let expected = at(0.5) - at(-0.5);
                 assert!((f64::from(d_g[i]) - expected).abs() < 5e-3, "{i}: {} is not {expected}", d_g[i]);
             }

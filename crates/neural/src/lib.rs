@@ -1,4 +1,34 @@
-//! Learned scene representations trained on one capture: NeRF, NeuS and DVGO on kernels of our own.
+//! Learned scene representations of one capture, trained on the processor with kernels of our own.
+//!
+//! In: a [`mb_capture::Sequence`]. Out: a mesh ([`reconstruct`]) or pictures of the held-out views ([`synthesize`]), in
+//! the sequence's metric world frame. [`FieldOptions`] says which method (`nerf`, `neus`) and how.
+//!
+//! ```no_run
+//! # fn main() -> mb_job::Result<()> {
+//! use mb_neural::{FieldOptions, reconstruct};
+//! let sequence = mb_capture::Sequence::open("castle")?;
+//! let options = FieldOptions::preset("neus", "fast", 0).expect("a known method");
+//! let (mesh, summary) = reconstruct(&sequence, &options, &mb_job::Silent)?;
+//! println!("{} triangles after {:.0} s", mesh.triangles.len(), summary.training.seconds);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! The layers, from below:
+//! - kernels: [`simd`] (one matrix product, dispatched at run time), [`mlp`], [`hash_grid`], [`dense_grid`],
+//!   [`encoding`], [`composite`], [`neus_alpha`], [`sampling`], [`adam`]. Derivatives are derived by hand; each module
+//!   states its equations, and its tests hold them to finite differences.
+//! - fields: [`radiance_field`] (density and colour), [`sdf_field`] (distance, exact normals, colour).
+//! - methods: [`nerf`], [`neus`], behind [`model::Model`]; [`dataset`] gives them rays, [`trainer`] runs them,
+//!   [`extract`] takes the surface.
+//!
+//! A step is cut into a fixed number of groups of rays. Each has its own random numbers, and their sums are added in
+//! order, so a run's result depends on the seed and the machine's instruction set, not on the number of threads.
+//!
+//! Limits: pinhole cameras without distortion; one exposure for all photographs; no GPU path yet.
+
+#![allow(clippy::needless_range_loop, reason = "kernels index several small arrays by axis and lane")]
+#![allow(clippy::too_many_arguments, reason = "kernels take buffers with their strides")]
 
 pub mod adam;
 pub mod composite;
@@ -6,11 +36,13 @@ pub mod contraction;
 pub mod dataset;
 pub mod dense_grid;
 pub mod encoding;
+pub mod extract;
 pub mod hash_grid;
+mod method;
 pub mod mlp;
 pub mod model;
-pub mod network;
 pub mod nerf;
+pub mod network;
 pub mod neus;
 pub mod neus_alpha;
 pub mod occupancy;
@@ -20,3 +52,5 @@ pub mod sampling;
 pub mod sdf_field;
 pub mod simd;
 pub mod trainer;
+
+pub use method::{FieldOptions, Method, ReconstructSummary, SynthesizeSummary, ViewScore, reconstruct, synthesize};

@@ -256,7 +256,15 @@ impl Mlp {
         }
     }
 
-    fn multiply(&self, layer: &Layer, w: &[f32], x: (&[f32], usize), rows: usize, out: (&mut Vec<f32>, usize), bias: bool) {
+    fn multiply(
+        &self,
+        layer: &Layer,
+        w: &[f32],
+        x: (&[f32], usize),
+        rows: usize,
+        out: (&mut Vec<f32>, usize),
+        bias: bool,
+    ) {
         let (out, out_stride) = out;
         out.resize(rows * out_stride, 0.0);
         let init = if bias { Init::Row(&w[layer.bias..][..layer.out_stride]) } else { Init::Zero };
@@ -613,15 +621,27 @@ mod tests {
     const SHAPES: [MlpShape; 4] = [
         MlpShape { inputs: 5, width: 16, hidden: 1, outputs: 3, activation: Activation::Relu, skip: None },
         MlpShape {
-            inputs: 6, width: 24, hidden: 3, outputs: 9, activation: Activation::Softplus { beta: 3.0 },
+            inputs: 6,
+            width: 24,
+            hidden: 3,
+            outputs: 9,
+            activation: Activation::Softplus { beta: 3.0 },
             skip: Some(Skip { layer: 2, narrow: true }),
         },
         MlpShape {
-            inputs: 7, width: 16, hidden: 3, outputs: 1, activation: Activation::Softplus { beta: 2.0 },
+            inputs: 7,
+            width: 16,
+            hidden: 3,
+            outputs: 1,
+            activation: Activation::Softplus { beta: 2.0 },
             skip: Some(Skip { layer: 3, narrow: false }),
         },
         MlpShape {
-            inputs: 4, width: 12, hidden: 2, outputs: 2, activation: Activation::Relu,
+            inputs: 4,
+            width: 12,
+            hidden: 2,
+            outputs: 2,
+            activation: Activation::Relu,
             skip: Some(Skip { layer: 1, narrow: false }),
         },
     ];
@@ -666,7 +686,11 @@ mod tests {
     /// A loss of outputs and gradients with fixed coefficients, so that its derivatives are known.
     fn loss(mlp: &Mlp, w: &[f64], x: &[Vec<f64>], d_out: &[Vec<f64>], d_g: &[Vec<f64>]) -> f64 {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        x.iter().zip(d_out).zip(d_g).map(|((x, o), g)| dot(&oracle(mlp, w, x), o) + dot(&oracle_gradient(mlp, w, x), g)).sum()
+        x.iter()
+            .zip(d_out)
+            .zip(d_g)
+            .map(|((x, o), g)| dot(&oracle(mlp, w, x), o) + dot(&oracle_gradient(mlp, w, x), g))
+            .sum()
     }
 
     fn pad(rows: &[Vec<f64>], stride: usize) -> Vec<f32> {
@@ -715,7 +739,11 @@ mod tests {
                         loss(&mlp, &w, &x, &d_out, &d_g)
                     };
                     let expected = (at(1e-4) - at(-1e-4)) / 2e-4;
-                    assert!((f64::from(grads[i]) - expected).abs() < 2e-3, "{shape:?} {i}: {} is not {expected}", grads[i]);
+                    assert!(
+                        (f64::from(grads[i]) - expected).abs() < 2e-3,
+                        "{shape:?} {i}: {} is not {expected}",
+                        grads[i]
+                    );
                     checked += 1;
                 }
                 for i in (0..(l.inputs + 1) * l.out_stride).filter(|i| i % l.out_stride >= l.outputs) {
@@ -741,7 +769,11 @@ mod tests {
     #[test]
     fn geometric_initialisation_is_a_sphere() {
         let mlp = Mlp::new(MlpShape {
-            inputs: 39, width: 256, hidden: 8, outputs: 257, activation: Activation::Softplus { beta: 100.0 },
+            inputs: 39,
+            width: 256,
+            hidden: 8,
+            outputs: 257,
+            activation: Activation::Softplus { beta: 100.0 },
             skip: Some(Skip { layer: 4, narrow: true }),
         });
         let parameters = mlp.init_geometric(0.5, &mut mb_job::rng(3, 0));

@@ -39,6 +39,10 @@ pub trait Model: Sync {
     fn level(&self) -> Level;
     /// The function whose level set is the surface, at points of the scene frame.
     fn surface(&self, positions: &[[f32; 3]]) -> Vec<f32>;
+    /// Whether the surface may cross a box of the scene frame; a box where it cannot is not evaluated.
+    fn may_cross(&self, low: [f32; 3], high: [f32; 3]) -> bool;
+    /// Colours of points of the scene frame, each seen along its (unit) direction.
+    fn color_at(&self, positions: &[[f32; 3]], directions: &[[f32; 3]]) -> Vec<[f32; 3]>;
     /// Everything that a checkpoint holds, always in the same order.
     fn buffers(&mut self) -> Vec<&mut Vec<f32>>;
     /// Called after a checkpoint has been read into the buffers, before `step`.

@@ -79,6 +79,16 @@ impl Default for NerfOptions {
     }
 }
 
+impl NerfOptions {
+    /// The same with another number of steps: the schedule follows.
+    #[must_use]
+    pub fn with_iterations(mut self, iterations: u64) -> Self {
+        self.iterations = iterations;
+        self.schedule = Schedule::WarmExponential { warm_up: 100.min(iterations / 10), end: iterations, floor: 0.03 };
+        self
+    }
+}
+
 /// Samples of a tile: where they are, how they group into rays, and what they became.
 #[derive(Debug, Default)]
 struct Tile {
@@ -200,7 +210,15 @@ impl Nerf {
         tile.runs.clear();
     }
 
-    fn run_group(&self, data: &RayDataset, rng: &mut Rng, rays: usize, scale: f32, transposed: &Transposed, group: &mut Group) {
+    fn run_group(
+        &self,
+        data: &RayDataset,
+        rng: &mut Rng,
+        rays: usize,
+        scale: f32,
+        transposed: &Transposed,
+        group: &mut Group,
+    ) {
         let Group { field: worker, tile, rays: targets, backgrounds, loss, marched } = group;
         data.draw(rng, rays, targets);
         (*loss, *marched) = (0.0, 0);
@@ -231,11 +249,16 @@ impl Nerf {
                 };
                 let error: [f32; 3] = std::array::from_fn(|c| tile.composites[i].rgb[c] - wanted[c]);
                 *loss += error.iter().map(|e| f64::from(e * e)).sum::<f64>();
-                let gradient =
-                    CompositeGradient { d_rgb: error.map(|e| 2.0 * scale * e), d_transmittance: 0.0 };
+                let gradient = CompositeGradient { d_rgb: error.map(|e| 2.0 * scale * e), d_transmittance: 0.0 };
                 composite_backward(
-                    &tile.alphas[run.clone()], &worker.rgb[run.clone()], backgrounds[i], &tile.weights[run.clone()],
-                    &tile.composites[i], &gradient, &mut worker.d_sigma[run.clone()], &mut worker.d_rgb[run],
+                    &tile.alphas[run.clone()],
+                    &worker.rgb[run.clone()],
+                    backgrounds[i],
+                    &tile.weights[run.clone()],
+                    &tile.composites[i],
+                    &gradient,
+                    &mut worker.d_sigma[run.clone()],
+                    &mut worker.d_rgb[run],
                 );
             }
             // d alpha / d sigma = dt (1 - alpha).
@@ -336,6 +359,23 @@ impl Model for Nerf {
             let tile: Vec<[f32; 3]> = tile.iter().map(|p| contract(*p)).collect();
             self.field.density(&self.parameters, &tile, &mut worker);
             out.extend_from_slice(&worker.sigma);
+        }
+        out
+    }
+
+    fn may_cross(&self, low: [f32; 3], high: [f32; 3]) -> bool {
+        self.occupancy.any_occupied(contract(low), contract(high))
+    }
+
+    fn color_at(&self, positions: &[[f32; 3]], directions: &[[f32; 3]]) -> Vec<[f32; 3]> {
+        let mut worker = RadianceWorker::default();
+        let mut out = Vec::with_capacity(positions.len());
+        for (positions, directions) in positions.chunks(TILE).zip(directions.chunks(TILE)) {
+            let tile: Vec<[f32; 3]> = positions.iter().map(|p| contract(*p)).collect();
+            let runs: Vec<_> = directions.iter().map(|d| (1, *d)).collect();
+            self.field.density(&self.parameters, &tile, &mut worker);
+            self.field.color(&self.parameters, &runs, &mut worker);
+            out.extend_from_slice(&worker.rgb);
         }
         out
     }

@@ -29,7 +29,13 @@ impl Network {
             }
         }
         let transposed = mlp.transpose(&values);
-        Self { mlp, effective: values.clone(), transposed, direct: Parameters::new(values), gains: Parameters::new(gains) }
+        Self {
+            mlp,
+            effective: values.clone(),
+            transposed,
+            direct: Parameters::new(values),
+            gains: Parameters::new(gains),
+        }
     }
 
     /// Its sizes.
@@ -119,9 +125,8 @@ mod tests {
 
     #[test]
     fn normalisation_keeps_the_initial_weights_and_has_the_derivative_of_finite_differences() {
-        let mlp = Mlp::new(MlpShape {
-            inputs: 3, width: 8, hidden: 2, outputs: 2, activation: Activation::Relu, skip: None,
-        });
+        let mlp =
+            Mlp::new(MlpShape { inputs: 3, width: 8, hidden: 2, outputs: 2, activation: Activation::Relu, skip: None });
         let mut rng = mb_job::rng(1, 0);
         let values = mlp.init_uniform(&mut rng);
         let mut network = Network::new(mlp, values.clone(), true);
@@ -133,7 +138,12 @@ mod tests {
         let loss = |n: &Network| n.effective.iter().zip(&coefficients).map(|(a, b)| f64::from(a * b)).sum::<f64>();
         network.add_gradient(&coefficients);
         let check = |found: f32, change: &dyn Fn(&mut Network, f32)| {
-            let at = |h: f32| { let mut n = network.clone(); change(&mut n, h); n.refresh(); loss(&n) };
+            let at = |h: f32| {
+                let mut n = network.clone();
+                change(&mut n, h);
+                n.refresh();
+                loss(&n)
+            };
             let expected = (at(1e-2) - at(-1e-2)) / 2e-2;
             assert!((f64::from(found) - expected).abs() < 2e-3, "{found} is not {expected}");
         };

@@ -283,7 +283,14 @@ impl Neus {
     }
 
     /// Computes everything of a tile: distances, normals, opacities, colours, composites.
-    fn shade(&self, tile: &mut Tile, sdf: &mut SdfWorker, outside: &mut RadianceWorker, backgrounds: &[[f32; 3]], anneal: f32) {
+    fn shade(
+        &self,
+        tile: &mut Tile,
+        sdf: &mut SdfWorker,
+        outside: &mut RadianceWorker,
+        backgrounds: &[[f32; 3]],
+        anneal: f32,
+    ) {
         let s = self.sharpness();
         self.field.distance(&tile.inner, sdf);
         self.drop_dark(tile, sdf, s);
@@ -351,7 +358,15 @@ impl Neus {
         }
     }
 
-    fn run_group(&self, data: &RayDataset, rng: &mut Rng, rays: usize, step: u64, transposed: &Transposed, group: &mut Group) {
+    fn run_group(
+        &self,
+        data: &RayDataset,
+        rng: &mut Rng,
+        rays: usize,
+        step: u64,
+        transposed: &Transposed,
+        group: &mut Group,
+    ) {
         let anneal = self.anneal(step);
         data.draw(rng, rays, &mut group.rays);
         (group.loss, group.squared, group.marched, group.d_sharpness) = (0.0, 0.0, 0, 0.0);
@@ -361,8 +376,7 @@ impl Neus {
             group.tile.clear();
             group.backgrounds.clear();
             while next < group.rays.len() && group.tile.inner.len() + group.tile.outer.len() < TILE {
-                let background =
-                    if self.with_masks { [0.0; 3] } else { std::array::from_fn(|_| rng.random()) };
+                let background = if self.with_masks { [0.0; 3] } else { std::array::from_fn(|_| rng.random()) };
                 group.backgrounds.push(background);
                 self.march(&group.rays[next].ray, rng.random(), &mut group.tile);
                 next += 1;
@@ -403,12 +417,17 @@ impl Neus {
             if let Some(mask) = mask {
                 let cover = (1.0 - found.transmittance).clamp(1e-3, 1.0 - 1e-3);
                 group.loss -= f64::from(self.options.mask * (mask * cover.ln() + (1.0 - mask) * (1.0 - cover).ln()));
-                gradient.d_transmittance =
-                    self.options.mask * scale * (mask / cover - (1.0 - mask) / (1.0 - cover));
+                gradient.d_transmittance = self.options.mask * scale * (mask / cover - (1.0 - mask) / (1.0 - cover));
             }
             composite_backward(
-                &tile.alphas[run.clone()], &tile.rgb[run.clone()], group.backgrounds[i], &tile.weights[run.clone()], found,
-                &gradient, &mut tile.d_alphas[run.clone()], &mut tile.d_rgb[run],
+                &tile.alphas[run.clone()],
+                &tile.rgb[run.clone()],
+                group.backgrounds[i],
+                &tile.weights[run.clone()],
+                found,
+                &gradient,
+                &mut tile.d_alphas[run.clone()],
+                &mut tile.d_rgb[run],
             );
         }
     }
@@ -587,6 +606,24 @@ impl Model for Neus {
         for tile in positions.chunks(TILE) {
             self.field.distance(tile, &mut worker);
             out.extend_from_slice(&worker.sdf);
+        }
+        out
+    }
+
+    fn may_cross(&self, low: [f32; 3], high: [f32; 3]) -> bool {
+        let unit = |p: [f32; 3]| p.map(|c| 0.5 * c + 0.5);
+        self.inner_cells.any_occupied(unit(low), unit(high))
+    }
+
+    fn color_at(&self, positions: &[[f32; 3]], directions: &[[f32; 3]]) -> Vec<[f32; 3]> {
+        let mut worker = SdfWorker::default();
+        let mut out = Vec::with_capacity(positions.len());
+        for (positions, directions) in positions.chunks(TILE).zip(directions.chunks(TILE)) {
+            let runs: Vec<_> = directions.iter().map(|d| (1, *d)).collect();
+            self.field.distance(positions, &mut worker);
+            self.field.normals(&mut worker);
+            self.field.color(&runs, &mut worker);
+            out.extend_from_slice(&worker.rgb);
         }
         out
     }

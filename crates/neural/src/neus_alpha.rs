@@ -56,8 +56,8 @@ impl Section {
         let d_p = q / ((p + EPSILON) * (p + EPSILON)) * p * (1.0 - p);
         let d_q = -q * (1.0 - q) / (p + EPSILON);
         let d_half = sharpness * (d_q - d_p);
-        let slope = if self.cosine < 1.0 { 0.5 * (1.0 - anneal) } else { 0.0 }
-            + if self.cosine < 0.0 { anneal } else { 0.0 };
+        let slope =
+            if self.cosine < 1.0 { 0.5 * (1.0 - anneal) } else { 0.0 } + if self.cosine < 0.0 { anneal } else { 0.0 };
         SectionGradient {
             sdf: sharpness * (d_p + d_q),
             cosine: d_half * 0.5 * self.dt * slope,

@@ -41,6 +41,14 @@ impl OccupancyGrid {
         self.occupied[(index(p[2]) * r + index(p[1])) * r + index(p[0])]
     }
 
+    /// Whether a cell that touches a box of the unit cube may hold something.
+    pub fn any_occupied(&self, low: [f32; 3], high: [f32; 3]) -> bool {
+        let r = self.resolution;
+        let index = |v: f32| ((v * r as f32).max(0.0) as usize).min(r - 1);
+        let [x, y, z]: [std::ops::RangeInclusive<usize>; 3] = std::array::from_fn(|d| index(low[d])..=index(high[d]));
+        z.into_iter().any(|z| y.clone().any(|y| x.clone().any(|x| self.occupied[(z * r + y) * r + x])))
+    }
+
     /// Share of the cells that are occupied.
     pub fn share(&self) -> f64 {
         self.occupied.iter().filter(|o| **o).count() as f64 / self.occupied.len() as f64
@@ -80,7 +88,8 @@ impl OccupancyGrid {
 
     /// Mean of the cells that have been looked at; infinite before the first look.
     pub fn mean(&self) -> f32 {
-        let (sum, n) = self.values.iter().filter(|v| v.is_finite()).fold((0.0, 0), |(s, n), v| (s + f64::from(*v), n + 1));
+        let (sum, n) =
+            self.values.iter().filter(|v| v.is_finite()).fold((0.0, 0), |(s, n), v| (s + f64::from(*v), n + 1));
         if n == 0 { f32::INFINITY } else { (sum / f64::from(n)) as f32 }
     }
 

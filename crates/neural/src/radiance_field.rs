@@ -85,7 +85,14 @@ impl RadianceField {
     pub fn new(options: &RadianceFieldOptions) -> Self {
         let grid = HashGrid::new(options.grid);
         let shape = |inputs, hidden, outputs| {
-            Mlp::new(MlpShape { inputs, width: options.width, hidden, outputs, activation: Activation::Relu, skip: None })
+            Mlp::new(MlpShape {
+                inputs,
+                width: options.width,
+                hidden,
+                outputs,
+                activation: Activation::Relu,
+                skip: None,
+            })
         };
         let density = shape(grid.width(), 1, GEOMETRY);
         let color = shape(COLOR_IN, options.color_hidden, 3);
@@ -164,7 +171,13 @@ impl RadianceField {
 
     /// Sends `worker.d_sigma` and `worker.d_rgb` back: gathers the networks' gradients in the worker, and what the hash
     /// grid will scatter. `positions` are those of the (compacted) tile.
-    pub fn backward(&self, p: &RadianceParameters, transposed: &Transposed, positions: &[[f32; 3]], worker: &mut RadianceWorker) {
+    pub fn backward(
+        &self,
+        p: &RadianceParameters,
+        transposed: &Transposed,
+        positions: &[[f32; 3]],
+        worker: &mut RadianceWorker,
+    ) {
         let (rows, stride) = (positions.len(), self.color.out_stride());
         worker.density_grads.resize(self.density.buffer_len(), 0.0);
         worker.color_grads.resize(self.color.buffer_len(), 0.0);
@@ -177,29 +190,39 @@ impl RadianceField {
         }
         let color = Weights { parameters: &p.color.values, transposed: &transposed.color };
         self.color.backward(
-            &color, &worker.color_in, COLOR_IN, &mut worker.color, &worker.d_out, None, &mut worker.color_grads, true,
+            &color,
+            &worker.color_in,
+            COLOR_IN,
+            &mut worker.color,
+            &worker.d_out,
+            None,
+            &mut worker.color_grads,
+            true,
         );
         worker.d_out.resize(rows * GEOMETRY, 0.0);
-        let sources = worker.color.d_input.chunks_exact(self.color.in_stride()).zip(worker.sigma.iter().zip(&worker.d_sigma));
+        let sources =
+            worker.color.d_input.chunks_exact(self.color.in_stride()).zip(worker.sigma.iter().zip(&worker.d_sigma));
         for (to, (from, (sigma, d_sigma))) in worker.d_out.chunks_exact_mut(GEOMETRY).zip(sources) {
             to.copy_from_slice(&from[..GEOMETRY]);
             to[0] += sigma * d_sigma;
         }
         let density = Weights { parameters: &p.density.values, transposed: &transposed.density };
         self.density.backward(
-            &density, &worker.features, self.stride(), &mut worker.density, &worker.d_out, None,
-            &mut worker.density_grads, true,
+            &density,
+            &worker.features,
+            self.stride(),
+            &mut worker.density,
+            &worker.d_out,
+            None,
+            &mut worker.density_grads,
+            true,
         );
         worker.positions.extend_from_slice(positions);
         worker.d_features.extend_from_slice(&worker.density.d_input[..rows * self.stride()]);
     }
 
     /// Adds everything that the workers gathered to the parameters' gradients, in the workers' order, and clears it.
-    pub fn collect<'a>(
-        &self,
-        p: &mut RadianceParameters,
-        workers: impl Iterator<Item = &'a mut RadianceWorker>,
-    ) {
+    pub fn collect<'a>(&self, p: &mut RadianceParameters, workers: impl Iterator<Item = &'a mut RadianceWorker>) {
         let workers: Vec<&mut RadianceWorker> = workers.collect();
         let stride = self.stride();
         let batches: Vec<Scatter<'_>> = workers
@@ -281,7 +304,12 @@ mod tests {
             field.density(p, &positions, &mut w);
             field.color(p, &rays, &mut w);
             let sigma: f64 = w.sigma.iter().zip(&d_sigma).map(|(a, b)| f64::from(a * b)).sum();
-            sigma + w.rgb.iter().zip(&d_rgb).map(|(a, b)| (0..3).map(|i| f64::from(a[i] * b[i])).sum::<f64>()).sum::<f64>()
+            sigma
+                + w.rgb
+                    .iter()
+                    .zip(&d_rgb)
+                    .map(|(a, b)| (0..3).map(|i| f64::from(a[i] * b[i])).sum::<f64>())
+                    .sum::<f64>()
         };
         let mut worker = RadianceWorker::default();
         field.density(&p, &positions, &mut worker);
@@ -296,12 +324,20 @@ mod tests {
             let mut misses = 0;
             let largest = grads.iter().fold(0.0f32, |a, g| a.max(g.abs()));
             for i in (0..grads.len()).step_by(7) {
-                let at = |h: f32| { let mut p = p.clone(); buffer(&mut p).values[i] += h; loss(&p) };
+                let at = |h: f32| {
+                    let mut p = p.clone();
+                    buffer(&mut p).values[i] += h;
+                    loss(&p)
+                };
                 let expected = (at(2e-3) - at(-2e-3)) / 4e-3;
                 // A step may cross a kink of ReLU; that is rare, and a wrong formula is not.
                 misses += usize::from((f64::from(grads[i]) - expected).abs() > 0.01 * f64::from(largest));
             }
-            assert!(misses * 50 <= grads.len() / 7, "buffer {b}: {misses} of {} derivatives are wrong", grads.len() / 7);
+            assert!(
+                misses * 50 <= grads.len() / 7,
+                "buffer {b}: {misses} of {} derivatives are wrong",
+                grads.len() / 7
+            );
         }
     }
 }

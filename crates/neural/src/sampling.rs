@@ -63,6 +63,8 @@ mod tests {
         let mut out = Vec::new();
         importance(&[0.0, 1.0, 2.0, 4.0], &[1.0, 0.0, 3.0], 4000, None, &mut out);
         let share = |a: f32, b: f32| out.iter().filter(|t| (a..b).contains(t)).count() as f32 / 4000.0;
-        assert!((share(0.0, 1.0) - 0.25).abs() < 1e-3 && share(1.0, 2.0) < 1e-3 && (share(2.0, 3.0) - 0.375).abs() < 1e-3);
+        assert!(
+            (share(0.0, 1.0) - 0.25).abs() < 1e-3 && share(1.0, 2.0) < 1e-3 && (share(2.0, 3.0) - 0.375).abs() < 1e-3
+        );
     }
 }

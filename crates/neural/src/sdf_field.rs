@@ -256,7 +256,8 @@ impl SdfField {
                 to[..3].copy_from_slice(&worker.encoded[row * in_stride..row * in_stride + 3]);
                 to[3..6].copy_from_slice(&worker.normals[row]);
                 to[6..6 + directions].copy_from_slice(&encoded);
-                to[6 + directions..][..features].copy_from_slice(&worker.geometry.out[row * out_stride + 1..][..features]);
+                to[6 + directions..][..features]
+                    .copy_from_slice(&worker.geometry.out[row * out_stride + 1..][..features]);
                 row += 1;
             }
         }
@@ -302,8 +303,14 @@ impl SdfField {
         }
         let weights = self.geometry.weights();
         self.geometry.mlp().backward(
-            &weights, &worker.encoded, stride, &mut worker.geometry, &worker.d_out, Some(&worker.d_gradient),
-            &mut worker.geometry_grads, self.grid.is_some(),
+            &weights,
+            &worker.encoded,
+            stride,
+            &mut worker.geometry,
+            &worker.d_out,
+            Some(&worker.d_gradient),
+            &mut worker.geometry_grads,
+            self.grid.is_some(),
         );
         if self.grid.is_some() {
             worker.gathered.units.extend_from_slice(&worker.units);
@@ -323,8 +330,14 @@ impl SdfField {
         }
         let weights = self.color.weights();
         self.color.mlp().backward(
-            &weights, &worker.color_in, self.color_stride(), &mut worker.color, &worker.d_out, None,
-            &mut worker.color_grads, true,
+            &weights,
+            &worker.color_in,
+            self.color_stride(),
+            &mut worker.color,
+            &worker.d_out,
+            None,
+            &mut worker.color_grads,
+            true,
         );
         worker.d_out.clear();
         worker.d_out.resize(rows * out_stride, 0.0);
@@ -407,20 +420,32 @@ mod tests {
     #[test]
     fn derivatives_through_normals_agree_with_finite_differences() {
         let hash = HashGridOptions { levels: 2, features: 2, log2_entries: 7, coarsest: 2, finest: 4 };
-        for (position, weight_norm) in [(PositionEncoding::Hash(hash), false), (PositionEncoding::Frequencies(2), true)] {
+        for (position, weight_norm) in [(PositionEncoding::Hash(hash), false), (PositionEncoding::Frequencies(2), true)]
+        {
             let mut rng = mb_job::rng(11, 0);
             let options = SdfFieldOptions {
-                position, direction: DirectionEncoding::Frequencies(1), width: 24, hidden: 2, skip: Some(1), features: 5,
-                softplus: 4.0, color_width: 12, color_hidden: 1, weight_norm, initial_radius: 0.5,
+                position,
+                direction: DirectionEncoding::Frequencies(1),
+                width: 24,
+                hidden: 2,
+                skip: Some(1),
+                features: 5,
+                softplus: 4.0,
+                color_width: 12,
+                color_hidden: 1,
+                weight_norm,
+                initial_radius: 0.5,
             };
             let mut field = SdfField::new(options, &mut rng);
             for buffer in field.buffers().into_iter().step_by(3) {
                 buffer.iter_mut().filter(|v| **v != 0.0).for_each(|v| *v += rng.random_range(-0.3..0.3));
             }
             field.refresh();
-            let positions: Vec<[f32; 3]> = (0..5).map(|_| std::array::from_fn(|_| rng.random_range(-0.7..0.7f32))).collect();
+            let positions: Vec<[f32; 3]> =
+                (0..5).map(|_| std::array::from_fn(|_| rng.random_range(-0.7..0.7f32))).collect();
             let rays = [(3u32, [0.0, 0.6, 0.8]), (2, [0.0, -1.0, 0.0])];
-            let mut threes = || (0..5).map(|_| std::array::from_fn(|_| rng.random_range(-1.0..1.0f32))).collect::<Vec<[f32; 3]>>();
+            let mut threes =
+                || (0..5).map(|_| std::array::from_fn(|_| rng.random_range(-1.0..1.0f32))).collect::<Vec<[f32; 3]>>();
             let (d_normals, d_rgb, more) = (threes(), threes(), threes());
             let d_sdf: Vec<f32> = more.iter().map(|v| v[0]).collect();
             let forward = |field: &SdfField| {
@@ -449,7 +474,11 @@ mod tests {
                         f64::from(w.sdf[0])
                     };
                     let expected = (at(1e-3) - at(-1e-3)) / 2e-3;
-                    assert!((f64::from(worker.normals[s][d]) - expected).abs() < 5e-3, "{} is not {expected}", worker.normals[s][d]);
+                    assert!(
+                        (f64::from(worker.normals[s][d]) - expected).abs() < 5e-3,
+                        "{} is not {expected}",
+                        worker.normals[s][d]
+                    );
                 }
             }
             (worker.d_sdf, worker.d_normals, worker.d_rgb) = (d_sdf.clone(), d_normals.clone(), d_rgb.clone());
@@ -464,8 +493,13 @@ mod tests {
                 probe.step(&options, 1e6, 1e6, 1);
                 let mut start = before.clone();
                 let start: Vec<Vec<f32>> = start.buffers().into_iter().step_by(3).map(|b| b.clone()).collect();
-                probe.buffers().into_iter().step_by(3).zip(start)
-                    .map(|(a, b)| a.iter().zip(&b).map(|(a, b)| b - a).collect()).collect()
+                probe
+                    .buffers()
+                    .into_iter()
+                    .step_by(3)
+                    .zip(start)
+                    .map(|(a, b)| a.iter().zip(&b).map(|(a, b)| b - a).collect())
+                    .collect()
             };
             for (b, grad) in grads.iter().enumerate() {
                 let largest = grad.iter().fold(0.0f32, |a, g| a.max(g.abs()));

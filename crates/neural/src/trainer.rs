@@ -133,7 +133,11 @@ pub fn train(
             }
             let left = point.seconds / (step - first_step) as f64 * (total - step) as f64;
             what = format!(
-                "training {}: {:.1} dB, loss {:.4}, {} left", model.name(), point.psnr_db, point.loss, time(left)
+                "training {}: {:.1} dB, loss {:.4}, {} left",
+                model.name(),
+                point.psnr_db,
+                point.loss,
+                time(left)
             );
             curve.push(point);
         }
@@ -224,7 +228,8 @@ fn read_checkpoint(path: &Path, expected: &CheckpointHeader, model: &mut dyn Mod
     let rest = bytes.strip_prefix(MAGIC).ok_or_else(|| other("not a checkpoint of this program"))?;
     let truncated = || other("the checkpoint is truncated");
     let (length, rest) = rest.split_first_chunk::<8>().ok_or_else(truncated)?;
-    let length = usize::try_from(u64::from_le_bytes(*length)).ok().filter(|n| *n <= rest.len()).ok_or_else(truncated)?;
+    let length =
+        usize::try_from(u64::from_le_bytes(*length)).ok().filter(|n| *n <= rest.len()).ok_or_else(truncated)?;
     let header: CheckpointHeader =
         serde_json::from_slice(&rest[..length]).map_err(|e| other(&format!("damaged header ({e})")))?;
     if header.method != expected.method || header.options != expected.options || header.lengths != expected.lengths {
@@ -249,8 +254,7 @@ fn read_checkpoint(path: &Path, expected: &CheckpointHeader, model: &mut dyn Mod
 /// Renders a view at its working size.
 pub fn render_view(model: &dyn Model, view: &View) -> RgbImage {
     let size = view.size();
-    let rays: Vec<_> =
-        (0..size.pixels()).map(|i| view.ray((i % size.width) as f32, (i / size.width) as f32)).collect();
+    let rays: Vec<_> = (0..size.pixels()).map(|i| view.ray((i % size.width) as f32, (i / size.width) as f32)).collect();
     let colors = model.render(&rays);
     Image::from_fn(size, |x, y| colors[y * size.width + x].map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8))
 }

@@ -22,9 +22,11 @@
 
 mod cube_table;
 mod integrate;
+mod level_set;
 mod marching_cubes;
 mod reconstruct;
 mod volume;
 
+pub use level_set::level_set_mesh;
 pub use reconstruct::{PoseSource, TsdfOptions, TsdfSummary, reconstruct_tsdf};
 pub use volume::{MAX_VOLUME_BYTES, TsdfVolume};

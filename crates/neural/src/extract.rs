@@ -1,0 +1,195 @@
+//! From a trained model to a mesh in the world frame.
+
+use mb_job::{Error, Progress, Result, Steps};
+use mb_mesh::TriangleMesh;
+use mb_recon::level_set_mesh;
+use mb_render::{Scene, View as RenderView};
+use nalgebra::{Point3, Vector3};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::dataset::RayDataset;
+use crate::model::Model;
+
+/// How a surface is extracted.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SurfaceOptions {
+    /// Spacing of the marching-cubes grid, millimetres of the sequence's world.
+    pub voxel_mm: f64,
+    /// Keep only what at least one camera sees.
+    pub cull: bool,
+}
+
+impl Default for SurfaceOptions {
+    fn default() -> Self {
+        Self { voxel_mm: 1.0, cull: true }
+    }
+}
+
+/// Points of a side of the blocks that are evaluated or skipped as one.
+const BLOCK: usize = 16;
+/// Largest grid: 1 GiB of numbers.
+const MAX_POINTS: usize = 1 << 28;
+
+/// The model's surface inside the region of interest: world frame, metres, vertex colours. Blocks without a cell that
+/// may hold the surface are not evaluated. With `cull`, triangles stay whose vertices a camera sees: in its image and
+/// no more than two voxels behind the surface's own depth map.
+///
+/// # Errors
+/// The grid would be too large; nothing was found; the person asked for a stop.
+pub fn extract(
+    model: &dyn Model,
+    data: &RayDataset,
+    options: &SurfaceOptions,
+    progress: &dyn Progress,
+) -> Result<TriangleMesh> {
+    let region = data.region();
+    let spacing = options.voxel_mm * 1e-3 / region.radius_m;
+    let points = (2.0 / spacing).ceil() + 1.0;
+    if !(points > 2.0 && points.powi(3) <= MAX_POINTS as f64) {
+        return Err(Error::Failed(format!(
+            "voxels of {} mm in a region of {:.0} mm make a grid of {points:.0}^3 points; at most {MAX_POINTS} are \
+             allowed: choose larger voxels",
+            options.voxel_mm,
+            2e3 * region.radius_m,
+        )));
+    }
+    let n = points as usize;
+    let values = evaluate(model, n, spacing as f32, progress)?;
+    let mut mesh = level_set_mesh([n; 3], &values);
+    drop(values);
+    if mesh.triangles.is_empty() {
+        return Err(Error::Failed(format!(
+            "{} found no surface in the region of interest; train longer, or check the poses",
+            model.name()
+        )));
+    }
+    let scene: Vec<Point3<f64>> =
+        mesh.vertices.iter().map(|v| Point3::from(v.coords * spacing - Vector3::repeat(1.0))).collect();
+    mesh.vertices = scene.iter().map(|p| region.world_from_scene(p)).collect();
+    if options.cull {
+        mesh = cull(mesh, data, options.voxel_mm * 1e-3, progress)?;
+        if mesh.triangles.is_empty() {
+            return Err(Error::Failed("no camera sees the surface that was found; check the poses".to_owned()));
+        }
+    }
+    color(&mut mesh, model, data);
+    Ok(mesh)
+}
+
+/// The level-set function on the grid: negative inside, NaN outside the region.
+fn evaluate(model: &dyn Model, n: usize, spacing: f32, progress: &dyn Progress) -> Result<Vec<f32>> {
+    let level = model.level();
+    let signed = |v: f32| if level.larger_inside { level.value - v } else { v - level.value };
+    let position = |x: usize, y: usize, z: usize| [x, y, z].map(|i| i as f32 * spacing - 1.0);
+    let mut values = vec![f32::NAN; n * n * n];
+    let steps = Steps::new(progress, "evaluating the surface", n.div_ceil(BLOCK));
+    values.par_chunks_mut(n * n * BLOCK).enumerate().try_for_each(|(slab, values)| {
+        let z0 = slab * BLOCK;
+        let depth = values.len() / (n * n);
+        for y0 in (0..n).step_by(BLOCK) {
+            for x0 in (0..n).step_by(BLOCK) {
+                let (width, height) = (BLOCK.min(n - x0), BLOCK.min(n - y0));
+                let mut slots = Vec::with_capacity(BLOCK.pow(3));
+                let mut inside = Vec::with_capacity(BLOCK.pow(3));
+                for z in 0..depth {
+                    for y in y0..y0 + height {
+                        for x in x0..x0 + width {
+                            let p = position(x, y, z0 + z);
+                            if p.iter().map(|c| c * c).sum::<f32>() <= 1.0 {
+                                slots.push((z * n + y) * n + x);
+                                inside.push(p);
+                            }
+                        }
+                    }
+                }
+                if inside.is_empty() {
+                    continue;
+                }
+                let (low, high) = (position(x0, y0, z0), position(x0 + width, y0 + height, z0 + depth));
+                if model.may_cross(low, high) {
+                    for (slot, v) in slots.into_iter().zip(model.surface(&inside)) {
+                        values[slot] = signed(v);
+                    }
+                } else {
+                    let v = signed(model.surface(&inside[inside.len() / 2..=inside.len() / 2])[0]);
+                    slots.into_iter().for_each(|slot| values[slot] = v);
+                }
+            }
+        }
+        steps.step()
+    })?;
+    Ok(values)
+}
+
+/// Keeps triangles with a vertex that some training camera sees.
+fn cull(mesh: TriangleMesh, data: &RayDataset, voxel_m: f64, progress: &dyn Progress) -> Result<TriangleMesh> {
+    let scene = Scene::new(&mesh);
+    let mut seen = vec![false; mesh.vertices.len()];
+    let steps = Steps::new(progress, "culling to what cameras saw", data.views().len());
+    for view in data.views() {
+        let cam_from_world = view.world_from_cam.inverse();
+        let depth =
+            scene.depth(&RenderView { intrinsics: view.intrinsics, size: view.size(), cam_from_frame: cam_from_world });
+        seen.par_iter_mut().zip(&mesh.vertices).filter(|(seen, _)| !**seen).for_each(|(seen, v)| {
+            let p = cam_from_world * *v;
+            if let Some(pixel) = view.intrinsics.img_from_cam(&p)
+                && pixel.x > -0.5
+                && pixel.y > -0.5
+                && let Some(z) = depth.get(pixel.x.round() as usize, pixel.y.round() as usize)
+            {
+                *seen = *z == 0.0 || p.z <= f64::from(*z) + 2.0 * voxel_m;
+            }
+        });
+        steps.step()?;
+    }
+    let kept = mesh.triangles.iter().filter(|t| t.iter().any(|v| seen[*v as usize])).copied().collect();
+    Ok(without_unused_vertices(&TriangleMesh::new(mesh.vertices, kept)))
+}
+
+fn without_unused_vertices(mesh: &TriangleMesh) -> TriangleMesh {
+    let mut new_index = vec![u32::MAX; mesh.vertices.len()];
+    let mut vertices = Vec::new();
+    let triangles = mesh
+        .triangles
+        .iter()
+        .map(|t| {
+            t.map(|v| {
+                let slot = &mut new_index[v as usize];
+                if *slot == u32::MAX {
+                    *slot = vertices.len() as u32;
+                    vertices.push(mesh.vertices[v as usize]);
+                }
+                *slot
+            })
+        })
+        .collect();
+    TriangleMesh::new(vertices, triangles)
+}
+
+/// Colours each vertex as it looks from straight above.
+fn color(mesh: &mut TriangleMesh, model: &dyn Model, data: &RayDataset) {
+    let mut normals = vec![Vector3::zeros(); mesh.vertices.len()];
+    for (i, triangle) in mesh.triangles.iter().enumerate() {
+        let normal = mesh.scaled_normal(i);
+        triangle.iter().for_each(|v| normals[*v as usize] += normal);
+    }
+    let region = data.region();
+    let colors: Vec<Vec<[u8; 3]>> = mesh
+        .vertices
+        .par_chunks(4096)
+        .zip(normals.par_chunks(4096))
+        .map(|(vertices, normals)| {
+            let positions: Vec<[f32; 3]> =
+                vertices.iter().map(|v| region.scene_from_world(v).coords.map(|c| c as f32).into()).collect();
+            let directions: Vec<[f32; 3]> = normals
+                .iter()
+                .map(|n| (-n.try_normalize(0.0).unwrap_or_else(Vector3::z)).map(|c| c as f32).into())
+                .collect();
+            let rgb = model.color_at(&positions, &directions);
+            rgb.into_iter().map(|c| c.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8)).collect()
+        })
+        .collect();
+    mesh.vertex_colors = Some(colors.concat());
+}
