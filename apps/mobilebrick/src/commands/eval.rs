@@ -1,0 +1,231 @@
+//! `eval`: scores of surfaces, views, depth maps and poses.
+
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand};
+use mb_eval::{
+    DepthOptions, SurfaceOptions, SurfaceProtocol, ThresholdScore, ViewsOptions, evaluate_depth, evaluate_poses,
+    evaluate_surface, evaluate_surface_method, evaluate_views, read_sequence_list,
+};
+use mb_job::{Error, Result};
+
+use super::Seed;
+
+use crate::outcome::Outcome;
+use crate::terminal::Terminal;
+
+/// Score surfaces, views, depth maps and poses
+#[derive(Debug, Subcommand)]
+pub enum Eval {
+    /// A reconstructed surface, or a method over a list of sequences
+    Surface(Surface),
+    /// Novel views: PSNR, SSIM, LPIPS; images are paired by file name
+    Views(Views),
+    /// Depth maps: 16-bit PNGs in millimetres, paired by file name, valid where both are above 0
+    Depth(Depth),
+    /// Camera poses: sequences, or folders with pose/*.txt
+    Poses(Poses),
+}
+
+impl Eval {
+    /// Runs the subcommand.
+    pub fn run(self, terminal: &Terminal) -> Result<Outcome> {
+        match self {
+            Self::Surface(c) => c.run(terminal),
+            Self::Views(c) => c.run(terminal),
+            Self::Depth(c) => c.run(terminal),
+            Self::Poses(c) => c.run(),
+        }
+    }
+}
+
+/// Two folders to compare.
+#[derive(Debug, Args)]
+struct Folders {
+    /// Ground truth
+    #[arg(long, value_name = "DIR")]
+    gt: PathBuf,
+
+    /// Prediction
+    #[arg(long, value_name = "DIR")]
+    pred: PathBuf,
+}
+
+/// A reconstructed surface, or a method over a list of sequences
+///
+/// One prediction: `--gt SEQ --pred MESH`. A table: `--method NAME --root DATA --list test_seqs.txt -o DIR`, with the
+/// predictions at ./meshes/NAME/SEQ.ply as the published scripts have them.
+#[derive(Debug, Args)]
+pub struct Surface {
+    /// Sequence with the ground truth
+    #[arg(long, value_name = "SEQ", requires = "pred", required_unless_present = "method", conflicts_with = "method")]
+    gt: Option<PathBuf>,
+
+    /// Mesh or point cloud to score, metres, the sequence's world frame
+    #[arg(long, value_name = "MESH", requires = "gt")]
+    pred: Option<PathBuf>,
+
+    /// Method whose predictions lie in the folder of that name
+    #[arg(long, value_name = "NAME", requires_all = ["root", "list", "out"])]
+    method: Option<String>,
+
+    /// Folder that holds the sequences
+    #[arg(long, value_name = "DATA", requires = "method")]
+    root: Option<PathBuf>,
+
+    /// File with the sequences' names, separated by commas or line ends
+    #[arg(long, value_name = "FILE", requires = "method")]
+    list: Option<PathBuf>,
+
+    /// Folder that holds a folder of meshes for each method
+    #[arg(long, value_name = "DIR", default_value = "meshes")]
+    meshes: PathBuf,
+
+    /// Folder for data.csv (as published), scores.csv and scores.json
+    #[arg(short, long, value_name = "DIR", requires = "method")]
+    out: Option<PathBuf>,
+
+    /// mobilebrick-2023 (as published) or exact-1
+    #[arg(long, default_value_t = SurfaceProtocol::default())]
+    protocol: SurfaceProtocol,
+
+    /// Points sampled on each surface
+    #[arg(long, value_name = "N", default_value_t = SurfaceOptions::default().points)]
+    points: usize,
+
+    /// A threshold beside 2.5 and 5 mm; may be repeated
+    #[arg(long = "threshold", value_name = "MM")]
+    thresholds: Vec<f64>,
+
+    #[command(flatten)]
+    seed: Seed,
+}
+
+impl Surface {
+    fn run(self, terminal: &Terminal) -> Result<Outcome> {
+        let options = SurfaceOptions {
+            protocol: self.protocol,
+            points: self.points,
+            seed: self.seed.seed,
+            more_thresholds_mm: self.thresholds,
+        };
+        if let (Some(method), Some(root), Some(list), Some(out)) = (self.method, self.root, self.list, self.out) {
+            let list = read_sequence_list(&list)?;
+            let table =
+                evaluate_surface_method(&method, &self.meshes.join(&method), &root, &list, &options, terminal)?;
+            table.write(&out)?;
+            let mut text = format!("{method}: {} of {} sequences scored\n", table.sequences.len(), list.len());
+            if let Some(mean) = &table.mean {
+                text += &score_lines(mean.chamfer.chamfer_mm, &mean.thresholds);
+            }
+            for missing in &table.missing {
+                text += &format!("no score for {}: {}\n", missing.sequence, missing.reason);
+            }
+            return Outcome::new(&table, text + &format!("wrote {}", out.display()));
+        }
+        let (Some(gt), Some(pred)) = (self.gt, self.pred) else {
+            return Err(Error::Failed("needs --gt and --pred, or --method, --root, --list and --out".into()));
+        };
+        let scores = evaluate_surface(&gt, &pred, &options, terminal)?;
+        let text = format!(
+            "{}, {}: ICP fitness {:.4}, {}\n{}",
+            scores.sequence,
+            scores.protocol,
+            scores.icp.fitness,
+            if scores.icp.applied { "prediction moved" } else { "prediction not moved" },
+            score_lines(scores.chamfer.chamfer_mm, &scores.thresholds)
+        );
+        Outcome::new(&scores, text)
+    }
+}
+
+/// The figures of the published tables, in percent as printed there.
+fn score_lines(chamfer_mm: f64, thresholds: &[ThresholdScore]) -> String {
+    let mut text = format!("Chamfer {chamfer_mm:.3} mm\n");
+    for t in thresholds {
+        text += &format!(
+            "{:>5} mm: accuracy {:6.2} %, recall {:6.2} %, F1 {:6.2} %\n",
+            t.threshold_mm,
+            t.accuracy * 100.0,
+            t.recall * 100.0,
+            t.f1 * 100.0
+        );
+    }
+    text
+}
+
+/// Novel views: PSNR, SSIM, LPIPS; images are paired by file name
+#[derive(Debug, Args)]
+pub struct Views {
+    #[command(flatten)]
+    folders: Folders,
+
+    /// Score every N-th image of the ground truth only; the paper holds out every 8th
+    #[arg(long, value_name = "N")]
+    hold_out: Option<usize>,
+
+    /// Folder of masks with the images' names; white is scored
+    #[arg(long, value_name = "DIR")]
+    masks: Option<PathBuf>,
+}
+
+impl Views {
+    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
+        let options = ViewsOptions { hold_out: self.hold_out, masks: self.masks.clone() };
+        let scores = evaluate_views(&self.folders.gt, &self.folders.pred, &options, None, terminal)?;
+        let lpips = scores.lpips.map_or_else(|| "no weights given".to_owned(), |v| format!("{v:.4}"));
+        let text = format!(
+            "{} images: PSNR {:.2} dB, SSIM {:.4}, LPIPS {lpips}",
+            scores.images, scores.psnr, scores.ssim
+        );
+        Outcome::new(&scores, text)
+    }
+}
+
+/// Depth maps: 16-bit PNGs in millimetres, paired by file name, valid where both are above 0
+#[derive(Debug, Args)]
+pub struct Depth {
+    #[command(flatten)]
+    folders: Folders,
+
+    /// Folder of confidence maps NAME_conf.png, for scores by confidence
+    #[arg(long, value_name = "DIR")]
+    confidence: Option<PathBuf>,
+}
+
+impl Depth {
+    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
+        let options = DepthOptions { confidence: self.confidence.clone(), ..DepthOptions::default() };
+        let scores = evaluate_depth(&self.folders.gt, &self.folders.pred, &options, terminal)?;
+        let m = &scores.mean;
+        let text = format!(
+            "{} pixels: AbsRel {:.4}, SqRel {:.4}, RMSE {:.4} m, RMSE log {:.4}, d1 {:.4}, d2 {:.4}, d3 {:.4}",
+            m.valid_pixels, m.abs_rel, m.sq_rel, m.rmse_m, m.rmse_log, m.delta1, m.delta2, m.delta3
+        );
+        Outcome::new(&scores, text)
+    }
+}
+
+/// Camera poses: sequences, or folders with pose/*.txt
+#[derive(Debug, Args)]
+pub struct Poses {
+    #[command(flatten)]
+    folders: Folders,
+}
+
+impl Poses {
+    fn run(&self) -> Result<Outcome> {
+        let scores = evaluate_poses(&self.folders.gt, &self.folders.pred)?;
+        let mut text = format!(
+            "{} frames: pairs {:.3} mm rms, {:.3} deg mean; after rigid alignment {:.3} mm rms",
+            scores.frames, scores.pairwise.translation_rmse_mm, scores.pairwise.rotation_mean_deg, scores.ate_rmse_mm
+        );
+        if let Some(object) = &scores.object {
+            text += &format!(
+                "\nin the object's frame {:.3} mm rms, {:.3} deg mean",
+                object.translation_rmse_mm, object.rotation_mean_deg
+            );
+        }
+        Outcome::new(&scores, text)
+    }
+}
