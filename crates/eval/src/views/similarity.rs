@@ -170,31 +170,59 @@ fn load(xs: &[f32], ys: &[f32], left: usize, n: usize, padded: &mut [[f32; STRIP
 /// Convolves a row with the window; neighbours of one channel are three values apart.
 #[inline(always)]
 fn blur_row(padded: &[f32; STRIP + 2 * HALO], window: &[f32; RADIUS + 1], blurred: &mut [f32; STRIP]) {
-    for i in 0..STRIP {
-        let mut sum = window[0] * padded[i + HALO];
+    for i in (0..STRIP).step_by(LANES) {
+        let at = |offset: usize| lanes(padded, i + offset);
+        let mut sum = scaled(at(HALO), window[0]);
         for k in 1..=RADIUS {
-            sum += window[k] * (padded[i + HALO - k * CHANNELS] + padded[i + HALO + k * CHANNELS]);
+            sum = added(sum, scaled(added(at(HALO - k * CHANNELS), at(HALO + k * CHANNELS)), window[k]));
         }
-        blurred[i] = sum;
+        blurred[i..i + LANES].copy_from_slice(&sum);
     }
 }
 
 /// Finishes the blur down the columns, and computes SSIM of every value.
 #[inline(always)]
 fn ssim_row(rows: &[&[[f32; STRIP]; MAPS]; TAPS], window: &[f32; RADIUS + 1], ssim: &mut [f32; STRIP]) {
-    for i in 0..STRIP {
-        let mut mean = [0f32; MAPS];
-        for map in 0..MAPS {
-            mean[map] = window[0] * rows[RADIUS][map][i];
+    for i in (0..STRIP).step_by(LANES) {
+        let mut means = [[0f32; LANES]; MAPS];
+        for (map, mean) in means.iter_mut().enumerate() {
+            let at = |k: usize| lanes(&rows[k][map], i);
+            *mean = scaled(at(RADIUS), window[0]);
             for k in 1..=RADIUS {
-                mean[map] += window[k] * (rows[RADIUS - k][map][i] + rows[RADIUS + k][map][i]);
+                *mean = added(*mean, scaled(added(at(RADIUS - k), at(RADIUS + k)), window[k]));
             }
         }
-        let [u, v, uu, vv] = mean;
-        let (u, v) = (u * u, v * v);
-        let (a, b) = (uu - u, vv - v);
-        ssim[i] = (u - v + 2.0 * C1) * (a - b + 2.0 * C2) / ((u + v + 2.0 * C1) * (a + b + 2.0 * C2));
+        for lane in 0..LANES {
+            let [u, v, uu, vv] = means.each_ref().map(|mean| mean[lane]);
+            let (u, v) = (u * u, v * v);
+            let (a, b) = (uu - u, vv - v);
+            ssim[i + lane] = (u - v + 2.0 * C1) * (a - b + 2.0 * C2) / ((u + v + 2.0 * C1) * (a + b + 2.0 * C2));
+        }
     }
+}
+
+/// `LANES` values from `at` on.
+#[inline(always)]
+fn lanes(values: &[f32], at: usize) -> [f32; LANES] {
+    let mut lanes = [0f32; LANES];
+    lanes.copy_from_slice(&values[at..at + LANES]);
+    lanes
+}
+
+#[inline(always)]
+fn added(mut a: [f32; LANES], b: [f32; LANES]) -> [f32; LANES] {
+    for lane in 0..LANES {
+        a[lane] += b[lane];
+    }
+    a
+}
+
+#[inline(always)]
+fn scaled(mut a: [f32; LANES], factor: f32) -> [f32; LANES] {
+    for lane in &mut a {
+        *lane *= factor;
+    }
+    a
 }
 
 #[inline(always)]
