@@ -14,6 +14,7 @@ mod ply;
 mod poisson_disk;
 mod sample;
 mod stl;
+mod surface;
 mod triangle_mesh;
 
 pub use bvh::{Bvh, Closest, Hit, closest_point_on_triangle};

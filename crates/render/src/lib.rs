@@ -21,14 +21,18 @@
 
 #![allow(clippy::needless_range_loop, reason = "kernels index several small arrays by axis and lane")]
 
+mod overlay;
 mod raster;
 mod ray_cast;
 mod scene;
 mod setup;
+mod shade;
 mod strip;
 mod view;
 
+pub use overlay::overlay_edges;
 pub use raster::{NO_TRIANGLE, Raster};
 pub use ray_cast::ray_cast;
 pub use scene::Scene;
+pub use shade::{RgbaImage, ShadeOptions, heat_colors, over, shade, three_quarter_view};
 pub use view::View;

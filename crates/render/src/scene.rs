@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::setup::{Corner, Setup};
 use crate::strip::{Piece, STRIP, Strip};
-use crate::{NO_TRIANGLE, Raster, View};
+use crate::{Raster, View};
 
 /// Consecutive triangles that are drawn together. Near clusters are drawn first, so that most of what they hide is
 /// found hidden at a glance.

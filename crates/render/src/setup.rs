@@ -11,6 +11,7 @@
 //! computes: no pixel falls between two triangles, and none belongs to both.
 
 use nalgebra::Vector3;
+use wide::f64x4;
 
 /// A vertex as seen from a view.
 #[derive(Debug, Clone, Copy)]
@@ -126,42 +127,36 @@ impl Setup {
     }
 
     #[inline]
-    pub(crate) fn row(&self, y: f64) -> Row<'_> {
+    pub(crate) fn row(&self, y: f64) -> Row {
         let along = |f: &Linear| f.b * y + f.c;
         let [a, b, c] = &self.sides;
-        Row { setup: self, sides: [along(a), along(b), along(c)], inverse_depth: along(&self.inverse_depth) }
+        Row { sides: [along(a), along(b), along(c)], inverse_depth: along(&self.inverse_depth) }
     }
-}
 
-/// The functions along one row of pixels.
-pub(crate) struct Row<'a> {
-    setup: &'a Setup,
-    sides: [f64; 3],
-    inverse_depth: f64,
-}
-
-impl Row<'_> {
-    /// Whether the pixel centre at column `x` belongs to the triangle.
+    /// Which of the pixel centres at columns `x` belong to the triangle, as a mask.
     #[inline]
-    pub(crate) fn contains(&self, x: f64) -> bool {
-        let side = |i: usize| self.setup.sides[i].a * x + self.sides[i] >= self.setup.least[i];
+    pub(crate) fn contains(&self, row: &Row, x: f64x4) -> f64x4 {
+        let side = |i: usize| {
+            let value = f64x4::splat(self.sides[i].a) * x + f64x4::splat(row.sides[i]);
+            value.simd_ge(f64x4::splat(self.least[i]))
+        };
         side(0) & side(1) & side(2)
     }
 
-    /// 1 / depth of the triangle at column `x`.
+    /// 1 / depth of the triangle at columns `x`.
     #[inline]
-    pub(crate) fn inverse_depth(&self, x: f64) -> f64 {
-        let (low, high) = self.setup.range;
-        let w = self.setup.inverse_depth.a * x + self.inverse_depth;
+    pub(crate) fn inverse_depth(&self, row: &Row, x: f64x4) -> f64x4 {
+        let (low, high) = (f64x4::splat(self.range.0), f64x4::splat(self.range.1));
+        let w = f64x4::splat(self.inverse_depth.a) * x + f64x4::splat(row.inverse_depth);
         // Written so that a number that is none, from a plane too steep for words, becomes the farthest.
-        let w = if w > low { w } else { low };
-        if w < high { w } else { high }
+        let w = w.simd_gt(low).bitselect(w, low);
+        w.simd_lt(high).bitselect(w, high)
     }
 
     /// The part of the columns `first..=last` that may belong to the triangle, a pixel too many rather than too few.
-    pub(crate) fn narrow(&self, first: usize, last: usize) -> (usize, usize) {
+    pub(crate) fn narrow(&self, row: &Row, first: usize, last: usize) -> (usize, usize) {
         let (mut low, mut high) = (first as f64, last as f64);
-        for (side, at) in self.setup.sides.iter().zip(self.sides) {
+        for (side, at) in self.sides.iter().zip(row.sides) {
             let crossing = -at / side.a;
             if side.a > 0.0 {
                 low = low.max(crossing - 1.0);
@@ -171,4 +166,10 @@ impl Row<'_> {
         }
         if low <= high { (low as usize, high as usize) } else { (1, 0) }
     }
+}
+
+/// The functions' constant parts along one row of pixels.
+pub(crate) struct Row {
+    sides: [f64; 3],
+    inverse_depth: f64,
 }

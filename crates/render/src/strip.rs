@@ -1,5 +1,7 @@
 //! A few rows of the image while triangles are drawn into them.
 
+use wide::f64x4;
+
 use crate::NO_TRIANGLE;
 use crate::setup::{Corner, Setup};
 
@@ -93,20 +95,25 @@ impl Strip {
         for row_index in first..=last {
             let row = setup.row((self.first_y + row_index) as f64);
             let (first_x, last_x) =
-                if columns.1 - columns.0 < WIDE { columns } else { row.narrow(columns.0, columns.1) };
+                if columns.1 - columns.0 < WIDE { columns } else { setup.narrow(&row, columns.0, columns.1) };
             let start = row_index * self.stride;
             for x in (first_x..=last_x).step_by(LANES) {
+                let px = f64x4::splat(x as f64) + f64x4::new([0.0, 1.0, 2.0, 3.0]);
+                let inside = setup.contains(&row, px);
+                if !inside.any() {
+                    continue;
+                }
                 let range = start + x..start + x + LANES;
                 let depths: &mut [f64; LANES] =
                     (&mut self.inverse_depth[range.clone()]).try_into().expect("a range of that length");
-                let triangles: &mut [u32; LANES] =
-                    (&mut self.triangle[range]).try_into().expect("a range of that length");
-                for lane in 0..LANES {
-                    let px = (x + lane) as f64;
-                    let w = row.inverse_depth(px);
-                    let seen = row.contains(px) & (w > depths[lane]);
-                    depths[lane] = if seen { w } else { depths[lane] };
-                    triangles[lane] = if seen { piece.triangle } else { triangles[lane] };
+                let before = f64x4::new(*depths);
+                let w = setup.inverse_depth(&row, px);
+                let seen = inside & w.simd_gt(before);
+                *depths = seen.bitselect(w, before).to_array();
+                let mut lanes = seen.to_bitmask();
+                while lanes != 0 {
+                    self.triangle[range.start + lanes.trailing_zeros() as usize] = piece.triangle;
+                    lanes &= lanes - 1;
                 }
             }
         }
