@@ -5,6 +5,7 @@
 //! leave this crate are OpenCV-style and metric (`docs/formats.md` has the layout file by file).
 
 mod alignment;
+mod check;
 mod colmap_model;
 mod export;
 mod import;
@@ -18,6 +19,7 @@ mod sequence;
 mod visibility;
 
 pub use alignment::{Alignment, AlignmentStage, FrameAlignment};
+pub use check::{CheckOptions, CheckSummary, PhotoCheck, Problem, check};
 pub use export::{ExportFormat, ExportSummary, export};
 pub use import::{CaptureFormat, ImportOptions, ImportSummary, SkippedFrame, import};
 pub use keypoints::{Keypoint, Keypoints};
