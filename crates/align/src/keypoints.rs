@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use mb_capture::{Alignment, AlignmentStage, FrameId, Keypoints, Sequence};
 use mb_geometry::{Object, Rigid3, World};
 use mb_job::{Error, InputError, Progress, Result, Steps};
-use nalgebra::{Matrix6, Point2};
+use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
 
-use crate::output::begin_stage;
+use crate::output::{begin_stage, rows};
 use crate::pnp::{Correspondence, PnpError, PnpOptions, PointLayout, PoseEstimate, PosedCamera, estimate_pose};
 
 /// How `align_keypoints` works.
@@ -176,10 +176,6 @@ fn explain(path: &Path, error: &PnpError) -> Error {
         }
     };
     InputError::new(path, error.to_string()).help(help).into()
-}
-
-fn rows(m: &Matrix6<f64>) -> [[f64; 6]; 6] {
-    std::array::from_fn(|row| std::array::from_fn(|col| m[(row, col)]))
 }
 
 fn summary(keypoints: &Keypoints, estimate: &PoseEstimate, frames: usize, written: PathBuf) -> KeypointSummary {

@@ -5,9 +5,14 @@ use std::path::PathBuf;
 
 use mb_capture::{Alignment, Sequence};
 use mb_job::{Error, Result};
+use nalgebra::Matrix6;
 
+/// Photographs with the model drawn in.
+pub(crate) const OVERLAYS: &str = "overlays";
+/// What a bundle adjustment used and left out.
+pub(crate) const BUNDLE: &str = "bundle.json";
 /// Files and folders that a stage writes beside `alignment.json`.
-const LATER_RESULTS: [&str; 2] = ["bundle.json", "overlays"];
+const LATER_RESULTS: [&str; 2] = [BUNDLE, OVERLAYS];
 
 /// Removes what earlier runs of any stage left in `alignment/` besides `alignment.json`, which the stage replaces, so
 /// that nothing there speaks of a pose that no longer holds. Returns where `alignment.json` goes.
@@ -22,4 +27,9 @@ pub(crate) fn begin_stage(sequence: &Sequence) -> Result<PathBuf> {
         }
     }
     Ok(file)
+}
+
+/// A covariance as alignment files have it.
+pub(crate) fn rows(m: &Matrix6<f64>) -> [[f64; 6]; 6] {
+    std::array::from_fn(|row| std::array::from_fn(|col| m[(row, col)]))
 }

@@ -277,7 +277,7 @@ fn mirrored(p: &Point3<f64>) -> Point3<f64> {
 
 /// Covariance of a left perturbation about the world's origin from that of one about `centroid`: a rotation `w` about
 /// the centroid `c` with a shift `v` is the same motion as a rotation `w` about the origin with the shift `v + c x w`.
-fn about_origin(about_centroid: &Matrix6<f64>, centroid: &Vector3<f64>) -> Matrix6<f64> {
+pub(crate) fn about_origin(about_centroid: &Matrix6<f64>, centroid: &Vector3<f64>) -> Matrix6<f64> {
     let mut map = Matrix6::identity();
     map.fixed_view_mut::<3, 3>(3, 0).copy_from(&centroid.cross_matrix());
     let covariance = map * about_centroid * map.transpose();
@@ -565,7 +565,11 @@ impl<'a> Problem<'a> {
 }
 
 /// The pose after a rotation `step[0..3]` about `center` and a shift `step[3..6]`, in the world.
-fn moved(pose: &Rigid3<World, Object>, step: &Vector6<f64>, center: &Vector3<f64>) -> Rigid3<World, Object> {
+pub(crate) fn moved<From>(
+    pose: &Rigid3<World, From>,
+    step: &Vector6<f64>,
+    center: &Vector3<f64>,
+) -> Rigid3<World, From> {
     let turn = nalgebra::UnitQuaternion::from_scaled_axis(step.fixed_rows::<3>(0).into_owned());
     let shift = step.fixed_rows::<3>(3) + center - turn * center;
     let mut rotation = turn * pose.rotation();
@@ -575,7 +579,7 @@ fn moved(pose: &Rigid3<World, Object>, step: &Vector6<f64>, center: &Vector3<f64
 
 /// The pixel of a point, and its derivative with respect to a rotation about `center` and a shift of the point in the
 /// world. `None` behind the camera.
-fn project(
+pub(crate) fn project(
     k: &Intrinsics,
     rotation: &Matrix3<f64>,
     translation: &Vector3<f64>,

@@ -1,0 +1,203 @@
+//! The edges of a model that a photograph may show: creases, borders of colours, and contours.
+
+use mb_geometry::{Camera, ImageSize, Intrinsics, Object, Rigid3};
+use mb_job::rng;
+use mb_mesh::TriangleMesh;
+use mb_render::{NO_TRIANGLE, Raster, Scene, View};
+use nalgebra::{Point2, Point3, Unit, Vector2, Vector3};
+use rand::seq::SliceRandom;
+
+/// Edges whose faces meet at less than this angle are flat: an artefact of the triangulation.
+const FLAT_RAD: f64 = 0.1;
+/// Distance between samples of an edge, metres.
+const SPACING_M: f64 = 1e-3;
+/// Samples kept of a model; more make no difference to the result.
+const MAX_SAMPLES: usize = 120_000;
+
+/// A point on an edge of the model.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct EdgeSample {
+    pub point_in_object: Point3<f64>,
+    pub direction: Unit<Vector3<f64>>,
+    /// Which edge; samples of one edge err together.
+    pub edge: u32,
+}
+
+/// An edge sample as a view shows it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct VisibleSample {
+    pub sample: EdgeSample,
+    pub pixel: Point2<f64>,
+    /// Across the edge in the image, unit length.
+    pub normal: Vector2<f64>,
+}
+
+/// A model prepared for comparing its edges with photographs.
+pub(crate) struct ModelEdges {
+    scene: Scene,
+    /// Unit normals of the triangles; zero where degenerate.
+    normals: Vec<Vector3<f64>>,
+    colors: Option<Vec<[u8; 3]>>,
+    samples: Vec<EdgeSample>,
+    pub centroid_in_object: Point3<f64>,
+}
+
+impl ModelEdges {
+    /// Finds every edge at which two faces of a part meet at an angle, or that only one face has, and spreads samples
+    /// over them in random order (which edges of a dense model are kept does not depend on their order in the file).
+    pub fn new(mesh: &TriangleMesh, seed: u64) -> Self {
+        let normals: Vec<Vector3<f64>> = (0..mesh.triangles.len())
+            .map(|t| mesh.scaled_normal(t).try_normalize(1e-18).unwrap_or_else(Vector3::zeros))
+            .collect();
+        // (part, lower corner, upper corner, triangle), so that sorting brings the faces of an edge together.
+        let corner_ids = weld(mesh);
+        let mut sides: Vec<(u32, u32, u32, u32)> = Vec::with_capacity(mesh.triangles.len() * 3);
+        for (t, triangle) in mesh.triangles.iter().enumerate() {
+            let part = mesh.triangle_parts.as_ref().map_or(0, |parts| parts[t]);
+            for k in 0..3 {
+                let (a, b) = (corner_ids[triangle[k] as usize], corner_ids[triangle[(k + 1) % 3] as usize]);
+                if a != b {
+                    sides.push((part, a.min(b), a.max(b), t as u32));
+                }
+            }
+        }
+        sides.sort_unstable();
+        let mut edges: Vec<(u32, u32)> = sides
+            .chunk_by(|a, b| (a.0, a.1, a.2) == (b.0, b.1, b.2))
+            .filter(|faces| {
+                let first = &normals[faces[0].3 as usize];
+                faces.len() == 1 || faces[1..].iter().any(|f| normals[f.3 as usize].dot(first).abs() < FLAT_RAD.cos())
+            })
+            .map(|faces| (faces[0].1, faces[0].2))
+            .collect();
+        edges.shuffle(&mut rng(seed, 0));
+        let mut samples = Vec::new();
+        for (edge, &(a, b)) in edges.iter().enumerate() {
+            let (a, b) = (mesh.vertices[a as usize], mesh.vertices[b as usize]);
+            let Some(direction) = Unit::try_new(b - a, 1e-9) else { continue };
+            let count = ((b - a).norm() / SPACING_M).ceil().clamp(1.0, 1000.0) as usize;
+            for i in 0..count {
+                let along = (i as f64 + 0.5) / count as f64;
+                samples.push(EdgeSample { point_in_object: a + (b - a) * along, direction, edge: edge as u32 });
+            }
+        }
+        samples.shuffle(&mut rng(seed, 1));
+        Self {
+            scene: Scene::new(mesh),
+            normals,
+            colors: mesh.triangle_colors.clone(),
+            samples,
+            centroid_in_object: mesh.bounds().center(),
+        }
+    }
+
+    /// Leaves only the samples that some of `views` shows, so that hidden ones cost nothing later.
+    pub fn keep_visible(&mut self, views: &[View<Object>]) {
+        let mut seen = vec![false; self.samples.len()];
+        for view in views {
+            let raster = self.scene.render(view);
+            for (seen, sample) in seen.iter_mut().zip(&self.samples) {
+                *seen = *seen || self.visible(sample, view, &raster).is_some();
+            }
+        }
+        let mut seen = seen.into_iter();
+        self.samples.retain(|_| seen.next().unwrap_or(false));
+        self.samples.truncate(MAX_SAMPLES);
+    }
+
+    /// Up to `limit` samples that the view shows as an edge.
+    pub fn visible_samples(&self, view: &View<Object>, limit: usize) -> Vec<VisibleSample> {
+        let raster = self.scene.render(view);
+        self.samples.iter().filter_map(|s| self.visible(s, view, &raster)).take(limit).collect()
+    }
+
+    fn visible(&self, sample: &EdgeSample, view: &View<Object>, raster: &Raster) -> Option<VisibleSample> {
+        /// Distance from the edge at which its two sides are looked at, pixels.
+        const ASIDE_PX: f64 = 1.6;
+        /// Steps in depth below this are no contour, metres.
+        const STEP_M: f64 = 5e-4;
+        let p = view.cam_from_frame * sample.point_in_object;
+        let pixel = view.intrinsics.img_from_cam(&p)?;
+        let margin = 4.0;
+        let inside = |v: f64, count: usize| v >= margin && v <= count as f64 - 1.0 - margin;
+        if !inside(pixel.x, view.size.width) || !inside(pixel.y, view.size.height) {
+            return None;
+        }
+        let normal = image_normal(&view.intrinsics, &view.cam_from_frame, sample, &p)?;
+        let side = |sign: f64| {
+            let q = pixel + normal * (sign * ASIDE_PX);
+            let at = (q.x.round() as usize, q.y.round() as usize);
+            (Point2::new(at.0 as f64, at.1 as f64), f64::from(raster.depth[at]), raster.triangle[at])
+        };
+        let sides = [side(1.0), side(-1.0)];
+        // One pixel of depth at this distance, as wide as the two looks are apart, on a steep face.
+        let tolerance = 8.0 * p.z / view.intrinsics.fx + 1e-4;
+        let shows = |&(_, z, t): &(Point2<f64>, f64, u32)| t != NO_TRIANGLE && (z - p.z).abs() < tolerance;
+        let covers = |&(_, z, t): &(Point2<f64>, f64, u32)| t != NO_TRIANGLE && z < p.z - tolerance;
+        if sides.iter().any(covers) || !sides.iter().any(shows) {
+            return None;
+        }
+        let [(q_a, z_a, t_a), (q_b, z_b, t_b)] = sides;
+        let is_edge = if t_a == NO_TRIANGLE || t_b == NO_TRIANGLE {
+            true
+        } else {
+            let (n_a, n_b) = (self.normals[t_a as usize], self.normals[t_b as usize]);
+            let a = view.intrinsics.cam_from_img(&q_a, z_a);
+            let b = view.intrinsics.cam_from_img(&q_b, z_b);
+            let step = view.cam_from_frame.rotate(&n_b).dot(&(a - b)).abs();
+            let recolored = self.colors.as_ref().is_some_and(|c| c[t_a as usize] != c[t_b as usize]);
+            n_a.dot(&n_b).abs() < 0.9 || step > STEP_M || recolored
+        };
+        is_edge.then_some(VisibleSample { sample: *sample, pixel, normal })
+    }
+}
+
+/// The direction across a sample's edge in the image; `None` where the edge points at the camera.
+pub(crate) fn image_normal(
+    k: &Intrinsics,
+    cam_from_object: &Rigid3<Camera, Object>,
+    sample: &EdgeSample,
+    p_in_cam: &Point3<f64>,
+) -> Option<Vector2<f64>> {
+    let d = cam_from_object.rotate(&sample.direction);
+    let along =
+        Vector2::new(k.fx * (d.x * p_in_cam.z - d.z * p_in_cam.x), k.fy * (d.y * p_in_cam.z - d.z * p_in_cam.y));
+    // Shorter than a fifth of an edge seen square on: too foreshortened to have a direction.
+    let shortest = 0.2 * k.fx * p_in_cam.z;
+    (along.norm() > shortest).then(|| Vector2::new(-along.y, along.x).normalize())
+}
+
+/// For each vertex, the first vertex at the same place (to a micrometre).
+fn weld(mesh: &TriangleMesh) -> Vec<u32> {
+    let key = |v: u32| mesh.vertices[v as usize].coords.map(|c| (c * 1e6).round() as i64);
+    let mut order: Vec<u32> = (0..mesh.vertices.len() as u32).collect();
+    order.sort_unstable_by_key(|&v| {
+        let k = key(v);
+        (k.x, k.y, k.z, v)
+    });
+    let mut ids = vec![0; mesh.vertices.len()];
+    for group in order.chunk_by(|&a, &b| key(a) == key(b)) {
+        for &v in group {
+            ids[v as usize] = group[0];
+        }
+    }
+    ids
+}
+
+/// A view of the object at `1 / 2^level` of the photograph's size.
+pub(crate) fn view_at(
+    intrinsics: &Intrinsics,
+    size: ImageSize,
+    cam_from_object: &Rigid3<Camera, Object>,
+    level: usize,
+) -> View<Object> {
+    let scale = 1.0 / f64::from(1u32 << level);
+    let intrinsics = Intrinsics {
+        fx: intrinsics.fx * scale,
+        fy: intrinsics.fy * scale,
+        cx: (intrinsics.cx + 0.5) * scale - 0.5,
+        cy: (intrinsics.cy + 0.5) * scale - 0.5,
+    };
+    let size = ImageSize::new(size.width >> level, size.height >> level);
+    View { intrinsics, size, cam_from_frame: *cam_from_object }
+}

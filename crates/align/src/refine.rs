@@ -1,0 +1,332 @@
+//! `align refine`: the object's pose, and the phone's drift, from the model's edges in the photographs.
+
+use std::path::PathBuf;
+
+use mb_capture::{Alignment, AlignmentStage, Frame, FrameAlignment, FrameId, Sequence};
+use mb_geometry::{Object, Rigid3, World};
+use mb_image::RgbImage;
+use mb_job::{Error, Progress, Result, Steps};
+use mb_mesh::read_mesh;
+use nalgebra::{Matrix6, Point2, Vector6};
+use serde::{Deserialize, Serialize};
+
+use crate::contour::{ContourFit, ContourFrame, DriftPrior, Observed, Uncertainty, motion_about, twist_about};
+use crate::model_edges::{ModelEdges, view_at};
+use crate::output::{OVERLAYS, begin_stage, rows};
+use crate::pnp::about_origin;
+use crate::profile::Pyramid;
+
+/// How `align_refine` works.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RefineOptions {
+    /// Photographs used, spread evenly over the sequence, at least 1; 8 or more to be sure of the result.
+    pub frames: usize,
+    /// Edge samples used of each photograph.
+    pub samples: usize,
+    /// Standard deviation of a phone pose's rotation about the object, degrees, above 0.
+    pub drift_deg: f64,
+    /// Standard deviation of a phone pose's shift of the object, millimetres, above 0.
+    pub drift_mm: f64,
+    /// Confidence below which the result is refused.
+    pub least_confidence: f64,
+    /// How many photographs are written with the model's edges drawn in.
+    pub overlays: usize,
+    /// Seed of the choice of samples.
+    pub seed: u64,
+}
+
+impl Default for RefineOptions {
+    fn default() -> Self {
+        // A phone's relative poses err by 4.5 mm and 0.6 degrees (Li et al. 2023, table 5).
+        Self { frames: 24, samples: 800, drift_deg: 0.6, drift_mm: 4.5, least_confidence: 0.15, overlays: 6, seed: 0 }
+    }
+}
+
+/// What came out, for people and programs.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RefineSummary {
+    /// The pose.
+    pub world_from_object: Rigid3<World, Object>,
+    /// How far the object moved from the pose it started at, millimetres.
+    pub moved_mm: f64,
+    /// How far it turned, degrees.
+    pub turned_deg: f64,
+    /// Root mean square distance between the model's edges and the photographs', pixels.
+    pub rms_px: f64,
+    /// Share of the model's visible edges that the photographs show where they should be.
+    pub agreement: f64,
+    /// The share that would be found by chance.
+    pub chance_agreement: f64,
+    /// 0 = no better than chance, 1 = every edge found.
+    pub confidence: f64,
+    /// Expected error of the object's position as each camera sees it, root mean square, millimetres.
+    pub expected_error_mm: f64,
+    /// Expected error of its rotation as each camera sees it, degrees.
+    pub expected_error_deg: f64,
+    /// Covariance of the object's pose in the world, left perturbation, `[rotation; translation]` (rad, m). Larger than
+    /// the errors above: the world itself is only known as well as the phone's drift allows.
+    pub covariance: [[f64; 6]; 6],
+    /// Every photograph used.
+    pub frames: Vec<RefinedFrame>,
+    /// Files written.
+    pub written: Vec<PathBuf>,
+    /// What deserves a look.
+    pub warnings: Vec<String>,
+}
+
+/// One photograph of a refinement.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RefinedFrame {
+    /// Which frame.
+    pub frame: FrameId,
+    /// Share of the model's visible edges found in it.
+    pub agreement: f64,
+    /// Root mean square distance to them, pixels.
+    pub rms_px: f64,
+    /// How far the phone's pose had drifted, as a shift of the object, millimetres.
+    pub drift_mm: f64,
+    /// The same as a turn, degrees.
+    pub drift_deg: f64,
+}
+
+/// Distance across an edge, in pixels, within which the photograph's edge counts as the model's.
+const AGREES_PX: f64 = 2.0;
+
+/// Refines an existing alignment by the model's edges.
+///
+/// Edges of `model/mesh.ply` that a rendering shows (creases, borders of colours, contours) are looked for in the
+/// photographs across their direction, each with up to four candidates, from an eighth of the photographs' size up to
+/// all of it. The object's pose and one small motion per frame are fitted together; the phone's poses are a prior of
+/// the size of their drift. Frames that were not used take the drift between their neighbours'. Writes
+/// `alignment/alignment.json` and pictures under `alignment/overlays/`.
+///
+/// # Errors
+/// There is no alignment to start from, no model mesh or no photograph; or the model's edges cannot be found in the
+/// photographs ([`Error::Failed`]; the earlier alignment stays).
+pub fn align_refine(sequence: &Sequence, options: &RefineOptions, progress: &dyn Progress) -> Result<RefineSummary> {
+    let start = sequence.read_alignment()?;
+    let mesh = read_mesh(sequence.model_mesh_path())?;
+    let chosen = choose(sequence, options.frames)?;
+    let size = sequence.image_size();
+    let coarsest = coarsest_level(size.width.min(size.height));
+
+    let steps = Steps::new(progress, "contour refinement", chosen.len() + LEVELS);
+    let mut edges = ModelEdges::new(&mesh, options.seed);
+    let views: Vec<_> = chosen
+        .iter()
+        .map(|f| view_at(&f.intrinsics, size, &(f.world_from_cam.inverse() * start.world_from_object), 1))
+        .collect();
+    edges.keep_visible(&views);
+    let mut frames = Vec::with_capacity(chosen.len());
+    for frame in &chosen {
+        frames.push(ContourFrame {
+            intrinsics: frame.intrinsics,
+            size,
+            cam_from_world: frame.world_from_cam.inverse(),
+            drift: Rigid3::identity(),
+            pyramid: Pyramid::new(sequence.read_image(frame)?, coarsest),
+        });
+        steps.step()?;
+    }
+    let mut fit = ContourFit {
+        edges: &edges,
+        frames,
+        world_from_object: start.world_from_object,
+        prior: DriftPrior { rotation_rad: options.drift_deg.to_radians(), translation_m: options.drift_mm * 1e-3 },
+        samples: options.samples,
+    };
+    coarse_to_fine(&mut fit, coarsest, &steps)?;
+
+    let (agreement, chance) = fit.agreement(0, AGREES_PX);
+    let confidence = ((agreement - chance) / (1.0 - chance).max(1e-9)).clamp(0.0, 1.0);
+    let observed = fit.observe(0, 4);
+    let uncertainty = fit.uncertainty(&observed, AGREES_PX);
+    let Some(uncertainty) = uncertainty.filter(|_| confidence >= options.least_confidence) else {
+        return Err(Error::Failed(format!(
+            "the model's edges were not found in the photographs: {:.0} % agree, {:.0} % would by chance. Check that the \
+             model is the one photographed and that the keypoints are right; the earlier alignment was kept",
+            100.0 * agreement,
+            100.0 * chance
+        )));
+    };
+    let written = begin_stage(sequence)?;
+    let mut outputs = write_overlays(sequence, &chosen, &fit, &observed, options.overlays)?;
+    let statistics = fit.frame_statistics(&observed, AGREES_PX);
+    let alignment = alignment(sequence, &chosen, &fit, &uncertainty, &statistics);
+    alignment.write(&written)?;
+    outputs.insert(0, written);
+    steps.step()?;
+
+    let frames: Vec<RefinedFrame> = chosen
+        .iter()
+        .zip(&fit.frames)
+        .zip(&statistics)
+        .map(|((frame, state), (agreement, rms_px))| {
+            let twist = fit.drift_twist(state);
+            RefinedFrame {
+                frame: frame.id,
+                agreement: *agreement,
+                rms_px: *rms_px,
+                drift_mm: twist.fixed_rows::<3>(3).norm() * 1e3,
+                drift_deg: twist.fixed_rows::<3>(0).norm().to_degrees(),
+            }
+        })
+        .collect();
+    let mut warnings: Vec<String> = frames
+        .iter()
+        .filter(|f| f.agreement < 0.5 * agreement)
+        .map(|f| {
+            format!(
+                "frame {}: only {:.0} % of the model's edges were found (blurred, dark, or the object moved?)",
+                f.frame,
+                100.0 * f.agreement
+            )
+        })
+        .collect();
+    let n = uncertainty.object_in_cam.len() as f64;
+    let mean_trace =
+        |at: usize| uncertainty.object_in_cam.iter().map(|c| c.fixed_view::<3, 3>(at, at).trace()).sum::<f64>() / n;
+    let (expected_error_mm, expected_error_deg) = (mean_trace(3).sqrt() * 1e3, mean_trace(0).sqrt().to_degrees());
+    if confidence < 2.0 * options.least_confidence || expected_error_mm > 1.0 {
+        warnings.push(format!(
+            "the result is uncertain (confidence {confidence:.2}, expected error {expected_error_mm:.2} mm): look at \
+             alignment/overlays"
+        ));
+    }
+    if chosen.len() < 8 {
+        warnings.push(format!("{} photographs were used; 8 or more make the result firm", chosen.len()));
+    }
+    let change = start.world_from_object.inverse() * fit.world_from_object;
+    let center = edges.centroid_in_object;
+    Ok(RefineSummary {
+        world_from_object: fit.world_from_object,
+        moved_mm: (change * center - center).norm() * 1e3,
+        turned_deg: change.angle_rad().to_degrees(),
+        rms_px: alignment.rms_px.unwrap_or(f64::NAN),
+        agreement,
+        chance_agreement: chance,
+        confidence,
+        expected_error_mm,
+        expected_error_deg,
+        covariance: alignment.object_covariance.unwrap_or_default(),
+        frames,
+        written: outputs,
+        warnings,
+    })
+}
+
+/// Passes over the pyramid, coarsest first: level below the coarsest, search range in its pixels, repetitions.
+const PASSES: [(usize, usize, usize); 4] = [(3, 10, 6), (2, 7, 4), (1, 6, 4), (0, 5, 4)];
+const LEVELS: usize = PASSES.len() + 1;
+
+/// The level at which the shorter side is about 150 pixels, at most 3.
+fn coarsest_level(shorter_side: usize) -> usize {
+    (0..=3).rev().find(|level| shorter_side >> level >= 150).unwrap_or(0)
+}
+
+fn coarse_to_fine(fit: &mut ContourFit, coarsest: usize, steps: &Steps) -> Result<()> {
+    for (level, range_px, repetitions) in PASSES {
+        if level <= coarsest {
+            for repetition in 0..repetitions {
+                let observed = fit.observe(level, range_px);
+                // Far edges count at first, near ones in the end.
+                let share = 1.0 - repetition as f64 / repetitions as f64;
+                let limit_px = (range_px as f64 * share).max(AGREES_PX);
+                for _ in 0..4 {
+                    fit.step(&observed, limit_px);
+                }
+            }
+        }
+        steps.step()?;
+    }
+    Ok(())
+}
+
+/// Frames with a photograph, spread evenly, posed as the phone has them.
+fn choose(sequence: &Sequence, count: usize) -> Result<Vec<Frame>> {
+    let with_image: Vec<&Frame> = sequence.frames().iter().filter(|f| f.image.is_some()).collect();
+    if with_image.is_empty() {
+        return Err(Error::input(sequence.root().join("image"), "no photographs to find the model's edges in"));
+    }
+    let count = count.clamp(1, with_image.len());
+    Ok((0..count).map(|i| with_image[i * with_image.len() / count].clone()).collect())
+}
+
+/// The alignment of every frame: those used with their own drift, the others with one between their neighbours'.
+fn alignment(
+    sequence: &Sequence,
+    chosen: &[Frame],
+    fit: &ContourFit,
+    uncertainty: &Uncertainty,
+    statistics: &[(f64, f64)],
+) -> Alignment {
+    let center = fit.center();
+    let ids: Vec<FrameId> = chosen.iter().map(|f| f.id).collect();
+    let twists: Vec<Vector6<f64>> = fit.frames.iter().map(|f| twist_about(&f.drift, &center)).collect();
+    let position = |id: FrameId| sequence.frames().partition_point(|f| f.id < id) as f64;
+    let frames = sequence
+        .frames()
+        .iter()
+        .map(|frame| {
+            let next = ids.partition_point(|id| *id < frame.id);
+            let used = ids.get(next) == Some(&frame.id);
+            let twist = if next == 0 || used {
+                twists[next]
+            } else if next == ids.len() {
+                twists[next - 1]
+            } else {
+                let (before, after) = (position(ids[next - 1]), position(ids[next]));
+                let share = (position(frame.id) - before) / (after - before);
+                twists[next - 1] * (1.0 - share) + twists[next] * share
+            };
+            FrameAlignment {
+                frame: frame.id,
+                world_from_cam: motion_about(&twist, &center).inverse() * frame.world_from_cam,
+                covariance: used.then(|| rows(&about_origin(&uncertainty.frames[next], &center))),
+                rms_px: used.then(|| statistics[next].1),
+            }
+        })
+        .collect();
+    let mean_sq = statistics.iter().map(|(_, rms)| rms * rms).sum::<f64>() / statistics.len() as f64;
+    let object: Matrix6<f64> = about_origin(&uncertainty.object, &center);
+    Alignment {
+        version: 1,
+        stage: AlignmentStage::Refine,
+        world_from_object: fit.world_from_object,
+        object_covariance: Some(rows(&object)),
+        rms_px: Some(mean_sq.sqrt()),
+        frames,
+    }
+}
+
+/// Draws the model's edges into photographs: green where the photograph has them, red where not.
+fn write_overlays(
+    sequence: &Sequence,
+    chosen: &[Frame],
+    fit: &ContourFit,
+    observed: &Observed,
+    count: usize,
+) -> Result<Vec<PathBuf>> {
+    let folder = sequence.root().join("alignment").join(OVERLAYS);
+    let count = count.min(chosen.len());
+    let mut written = Vec::with_capacity(count);
+    for i in (0..count).map(|i| i * chosen.len() / count) {
+        let mut picture = fit.frames[i].pyramid.level(0).clone();
+        for (pixel, found) in fit.drawn(observed, i, AGREES_PX) {
+            dot(&mut picture, &pixel, if found { [0, 255, 80] } else { [255, 40, 40] });
+        }
+        let path = folder.join(format!("{}.jpg", chosen[i].id));
+        mb_image::write_jpeg(&path, &picture, 90)?;
+        written.push(path);
+    }
+    Ok(written)
+}
+
+fn dot(picture: &mut RgbImage, pixel: &Point2<f64>, color: [u8; 3]) {
+    let size = picture.size();
+    let (x, y) = (pixel.x.round(), pixel.y.round());
+    if x >= 0.0 && y >= 0.0 && x < size.width as f64 && y < size.height as f64 {
+        picture[(x as usize, y as usize)] = color;
+    }
+}
