@@ -15,6 +15,22 @@ use pyo3::types::PyDict;
 use crate::arrays::colour_image;
 use crate::calls::{document, run};
 
+/// One file, or several that belong together.
+#[derive(FromPyObject)]
+pub enum Paths {
+    One(PathBuf),
+    Many(Vec<PathBuf>),
+}
+
+impl From<Paths> for Vec<PathBuf> {
+    fn from(paths: Paths) -> Self {
+        match paths {
+            Paths::One(path) => vec![path],
+            Paths::Many(paths) => paths,
+        }
+    }
+}
+
 /// Scores a mesh against the ground truth of a sequence.
 #[pyfunction]
 #[pyo3(signature = (gt, pred, *, protocol = "mobilebrick-2023", points = None, seed = 0))]
@@ -46,12 +62,12 @@ pub fn evaluate_views<'py>(
     hold_out: Option<usize>,
     masks: Option<PathBuf>,
     lpips_net: &str,
-    lpips_weights: Option<Vec<PathBuf>>,
+    lpips_weights: Option<Paths>,
 ) -> PyResult<Bound<'py, PyAny>> {
     let net: LpipsNet = lpips_net.parse().map_err(PyValueError::new_err)?;
     let options = ViewsOptions { hold_out, masks };
     let scores = run(py, |progress| {
-        let lpips = lpips_weights.map(|paths| Lpips::read(net, &paths)).transpose()?;
+        let lpips = lpips_weights.map(|paths| Lpips::read(net, &Vec::from(paths))).transpose()?;
         let perceptual = lpips.as_ref().map(|lpips| lpips as &dyn PerceptualMetric);
         eval_views(&gt, &pred, &options, perceptual, progress)
     })?;

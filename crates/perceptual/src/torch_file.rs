@@ -179,3 +179,47 @@ fn is_contiguous(view: &View) -> bool {
             fits
         })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const OLD: &[u8] = include_bytes!("../testdata/old.pth");
+    const NEW: &[u8] = include_bytes!("../testdata/new.pth");
+
+    #[test]
+    fn both_generations_of_files_hold_the_same_tensors() {
+        for bytes in [OLD, NEW] {
+            assert!(is_torch_file(bytes));
+            let tensors = read(Path::new("weights.pth"), bytes).unwrap();
+            assert_eq!(tensors.len(), 2);
+            let weight = &tensors["features.0.weight"];
+            assert_eq!((weight.shape.as_slice(), weight.data.as_slice()), (&[2, 3][..], &[1., 2., 3., 4., 5., 6.][..]));
+            assert_eq!(tensors["features.0.bias"].data, [-0.5, 0.25]);
+        }
+    }
+
+    #[test]
+    fn every_truncation_is_an_error() {
+        for bytes in [OLD, NEW] {
+            for length in LEGACY_MAGIC.len()..bytes.len() {
+                assert!(read(Path::new("weights.pth"), &bytes[..length]).is_err(), "{length} of {} bytes", bytes.len());
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn damage_ends_in_tensors_or_an_error(at in 15usize..400, byte in any::<u8>()) {
+            for bytes in [OLD, NEW] {
+                let mut bytes = bytes.to_vec();
+                let at = at % bytes.len();
+                bytes[at] = byte;
+                if is_torch_file(&bytes) {
+                    let _ = read(Path::new("weights.pth"), &bytes);
+                }
+            }
+        }
+    }
+}

@@ -1,6 +1,7 @@
 """The interface of the package; shapes and units are part of it."""
 
 import os
+import pathlib
 from typing import Any, Dict, Iterator, List, Literal, Optional, Sequence as Many, Tuple, Union
 
 import numpy as np
@@ -24,7 +25,7 @@ class Sequence:
     @property
     def name(self) -> str: ...
     @property
-    def path(self) -> str: ...
+    def path(self) -> pathlib.Path: ...
     @property
     def image_size(self) -> Tuple[int, int]:
         """Width and height of the photographs, which intrinsics refer to."""
@@ -153,7 +154,7 @@ def evaluate_views(
     hold_out: Optional[int] = None,
     masks: Optional[Path] = None,
     lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg",
-    lpips_weights: Optional[Many[Path]] = None,
+    lpips_weights: Union[Path, Many[Path], None] = None,
 ) -> Dict[str, Any]:
     """Scores a folder of rendered images, paired by file name: PSNR, SSIM and, with weights, LPIPS."""
 
