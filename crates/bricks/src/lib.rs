@@ -21,25 +21,38 @@
 //! Limits: only this crate knows LDraw units and axes. Textures are not drawn (their fallback geometry is).
 //! Conditional lines are ignored. Meshes of library parts are not closed; those that we draw ourselves are.
 
+mod build_order;
+mod check;
 mod clearance;
+mod collisions;
+mod connections;
 mod demo;
+mod external;
 mod flat;
 mod info;
 mod ldraw;
 mod model;
+mod neighbors;
 mod parametric;
+mod random;
 mod sketch;
+mod statics;
 mod write;
 
+pub use check::{CheckOptions, CheckReport, WeakestConnection};
+pub use collisions::Collision;
+pub use connections::{Connection, Connections, Group};
 pub use demo::demo_model;
+pub use external::{ExternalSummary, external_only};
 pub use flat::{METRES_PER_LDU, MeshOptions, NO_PART, object_from_ldraw};
 pub use info::{BomLine, BoxInfo, ModelInfo};
 pub use ldraw::colors::{Color, ColorCode, ColorTable};
 pub use ldraw::file::{
-    Affine, EdgeLine, Face, FileId, FileKind, LdrawFile, Reference, StepLine, StepView, normalized_name,
+    Affine, EdgeLine, Face, FileId, FileKind, LdrawFile, Reference, StepLine, StepView, StudSite, normalized_name,
 };
 pub use ldraw::library::PartLibrary;
 pub use ldraw::load::MissingPart;
 pub use ldraw::shape::PartShape;
 pub use model::{Model, Occurrence, PartInstance, ReadOptions};
 pub use parametric::drawable_parts;
+pub use random::{RandomModel, RandomOptions, RandomProfile, RandomSummary, Style, random_model, random_models};

@@ -13,6 +13,7 @@ mod special;
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
+use std::sync::{LazyLock, OnceLock};
 
 use nalgebra::Point3;
 
@@ -30,17 +31,33 @@ pub fn drawable_parts() -> impl Iterator<Item = (&'static str, &'static str)> {
     DESIGNS.iter().map(|design| (design.number, design.title))
 }
 
+/// Whether the LDraw part of that number can be drawn.
+pub(crate) fn can_draw(number: &str) -> bool {
+    Design::find(number).is_some()
+}
+
 /// The file that stands for the LDraw part `name` (such as `3001.dat`), where we can draw it.
 pub(crate) fn part_file(name: &str) -> Option<LdrawFile> {
+    static DRAWN: LazyLock<Vec<OnceLock<LdrawFile>>> =
+        LazyLock::new(|| DESIGNS.iter().map(|_| OnceLock::new()).collect());
     let design = Design::find(name.strip_suffix(".dat")?)?;
+    let index = DESIGNS.iter().position(|other| other.number == design.number)?;
+    let mut file = DRAWN.get(index)?.get_or_init(|| draw(design)).clone();
+    name.clone_into(&mut file.name);
+    Some(file)
+}
+
+fn draw(design: &Design) -> LdrawFile {
     let text = ldraw_text(design);
-    let document = parse(text.as_bytes(), "drawn by ourselves", name, Some(FileKind::Part), &mut Warnings::default());
-    document.ok()?.files.pop()
+    let kind = Some(FileKind::Part);
+    let document = parse(text.as_bytes(), "drawn by ourselves", design.number, kind, &mut Warnings::default());
+    document.ok().and_then(|mut document| document.files.pop()).expect("our own text is valid")
 }
 
 /// The design as an LDraw part file. Text is the only form, so that copies of it are exact.
 fn ldraw_text(design: &Design) -> String {
-    let surface = design.solid().surface();
+    let solid = design.solid();
+    let surface = solid.surface();
     let mut text = format!("0 {}\n0 Name: {}.dat\n", design.title, design.number);
     text.push_str("0 // Closed surface with nominal dimensions, drawn by MobileBrick\n");
     text.push_str("0 !LDRAW_ORG Unofficial_Part\n0 BFC CERTIFY CCW\n");
@@ -51,6 +68,12 @@ fn ldraw_text(design: &Design) -> String {
             let _ = write!(text, " {v}");
         }
     };
+    for stud in &solid.studs {
+        text.push_str("0 !MOBILEBRICK STUD");
+        point(&mut text, &stud.foot);
+        point(&mut text, &Point3::from(stud.axis));
+        text.push('\n');
+    }
     for [a, b] in sharp_edges(&surface) {
         text.push_str("2 24");
         point(&mut text, &a);

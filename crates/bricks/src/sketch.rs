@@ -2,9 +2,10 @@
 
 use std::fmt::Write as _;
 
-/// Stud pitch and plate height, LDraw units.
-const PITCH_LDU: f64 = 20.0;
-const PLATE_LDU: f64 = 8.0;
+/// Stud pitch, LDraw units.
+pub(crate) const PITCH_LDU: f64 = 20.0;
+/// Height of a plate, LDraw units.
+pub(crate) const PLATE_LDU: f64 = 8.0;
 
 /// An LDraw model under construction.
 pub(crate) struct Sketch {

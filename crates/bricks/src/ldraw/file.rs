@@ -136,6 +136,15 @@ pub struct StepLine {
     pub view: Option<StepView>,
 }
 
+/// A stud: the middle of its foot, and the direction in which it points.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StudSite {
+    /// Middle of the circle where it leaves the part, LDraw units.
+    pub foot: Point3<f64>,
+    /// Unit vector towards its tip.
+    pub axis: Vector3<f64>,
+}
+
 /// One LDraw file: a model, a part or a piece of a part.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LdrawFile {
@@ -157,6 +166,8 @@ pub struct LdrawFile {
     pub faces: Vec<Face>,
     /// Lines of type 2, in order.
     pub edges: Vec<EdgeLine>,
+    /// Studs that the file itself states (`0 !MOBILEBRICK STUD x y z dx dy dz`), as our own parts do.
+    pub studs: Vec<StudSite>,
     /// Step lines, in order. References after the last one form a last step.
     pub steps: Vec<StepLine>,
     /// Its own text, for copies that carry everything.

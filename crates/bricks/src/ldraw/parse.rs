@@ -8,7 +8,9 @@ use mb_job::{InputError, Result};
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::colors::{Color, ColorCode};
-use super::file::{Affine, EdgeLine, Face, FileKind, LdrawFile, Reference, StepLine, StepView, normalized_name};
+use super::file::{
+    Affine, EdgeLine, Face, FileKind, LdrawFile, Reference, StepLine, StepView, StudSite, normalized_name,
+};
 use super::warnings::Warnings;
 
 /// The longest line that is read. Real lines are a few hundred bytes.
@@ -91,6 +93,7 @@ impl OpenFile {
             references: vec![],
             faces: vec![],
             edges: vec![],
+            studs: vec![],
             steps: vec![],
             text: String::new(),
         };
@@ -226,6 +229,14 @@ impl Reader<'_> {
                 }
             }
             Some("!:") => {}
+            Some("!MOBILEBRICK") => {
+                if tokens.next() == Some("STUD")
+                    && let Ok([x, y, z, dx, dy, dz]) = tokens.numbers()
+                    && let Some(axis) = Vector3::new(dx, dy, dz).try_normalize(1e-6)
+                {
+                    open.file.studs.push(StudSite { foot: Point3::new(x, y, z), axis });
+                }
+            }
             Some("!COLOUR") => match Color::parse(tokens.0) {
                 Some(color) => self.colors.push(color),
                 None => self.warnings.add(

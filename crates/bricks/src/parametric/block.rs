@@ -3,7 +3,10 @@
 //! Dimensions are LDraw's nominal ones: pitch 20 units (8 mm), walls 4 units, studs 12 across and 4 high (4.8 and
 //! 1.6 mm), tubes 16 and 12 across, pins 8 across.
 
+use nalgebra::{Point3, Vector3};
+
 use super::columns::{Columns, circle, rectangle};
+use crate::ldraw::file::StudSite;
 
 /// Stud pitch.
 pub(crate) const PITCH: f64 = 20.0;
@@ -104,6 +107,8 @@ pub(crate) fn hollow_stud(solid: &mut Columns, center: [f64; 2], y: f64, floor: 
 /// A stud on the top at height `y`.
 pub(crate) fn stud(solid: &mut Columns, center: [f64; 2], y: f64) {
     solid.fill(circle(center, STUD_RADIUS), [y - STUD_HEIGHT, y + OVERLAP]);
+    let foot = Point3::new(center[0], y, center[1]);
+    solid.studs.push(StudSite { foot, axis: -Vector3::y() });
 }
 
 /// A brick or plate with a stud on every square.

@@ -13,6 +13,7 @@
 
 use std::cmp::Ordering;
 
+use crate::ldraw::file::StudSite;
 use nalgebra::Point3;
 use spade::{ConstrainedDelaunayTriangulation, InsertionError, Point2, Triangulation};
 
@@ -95,6 +96,8 @@ pub(crate) fn circle(center: [f64; 2], radius: f64) -> Outline {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Columns {
     operations: Vec<Operation>,
+    /// Where other bricks can be put on.
+    pub studs: Vec<StudSite>,
 }
 
 #[derive(Debug, Clone)]

@@ -3,8 +3,11 @@
 //! All run along x with the same section, and fall towards -z. Sections are those of the official parts; heights are
 //! counted downwards from the top of the brick.
 
+use nalgebra::{Point3, Vector3};
+
 use super::block::{BRICK, OVERLAP, PIN_RADIUS, STUD_RADIUS, WALL, hollow_stud, stud, tube};
 use super::columns::{Columns, Outline, Plane, circle, circle_corner, rectangle};
+use crate::ldraw::file::StudSite;
 
 /// The upright back part of a slope: outside and inside.
 const BACK: [f64; 2] = [-10.0, 10.0];
@@ -121,6 +124,7 @@ pub(crate) fn inverted_slope_45(half_x: f64) -> Columns {
         // The stud would touch the front wall along one line; a web makes them one.
         solid.fill_between(rectangle([x - 0.5, x + 0.5], [-26.5, -25.5]), Plane::level(0.0), below_floor);
         solid.empty_between(circle([x, -20.0], PIN_RADIUS), Plane::level(-5.0), floor);
+        solid.studs.push(StudSite { foot: Point3::new(x, 0.0, -20.0), axis: -Vector3::y() });
     }
     solid
 }

@@ -1,8 +1,11 @@
 //! Corners, jumpers, a grille, a panel, a brick with a stud on its side.
 
+use nalgebra::{Point3, Vector3};
+
 use super::block::{BRICK, Footprint, OVERLAP, PIN_RADIUS, PLATE, STUD_RADIUS, WALL, hollow, hollow_stud, stud, tile};
 use super::columns::{CIRCLE_SIDES, Columns, Plane, circle, circle_corner, rectangle};
 use super::slope::stud_holders;
+use crate::ldraw::file::StudSite;
 
 /// A plate or tile with one hollow stud in its middle.
 pub(crate) fn jumper(footprint: Footprint, groove: bool) -> Columns {
@@ -96,6 +99,7 @@ pub(crate) fn side_stud() -> Columns {
     solid.fill(footprint.outline(0.0), [0.0, BRICK]);
     hollow(&mut solid, footprint, BRICK);
     stud(&mut solid, [0.0, 0.0], 0.0);
+    solid.studs.push(StudSite { foot: Point3::new(0.0, 10.0, -10.0), axis: -Vector3::z() });
     // A lying cylinder is a row of strips between its upper and its lower half.
     let strips = |radius: f64, z: [f64; 2]| {
         (0..CIRCLE_SIDES / 2).map(move |side| {

@@ -1,0 +1,40 @@
+//! What reading, flattening and checking models cost, in CPU seconds. `cargo bench -p mb-bricks`
+
+use cpu_time::ProcessTime;
+use mb_bricks::{CheckOptions, MeshOptions, Model, PartLibrary, demo_model};
+
+fn timed<T>(what: &str, run: impl FnOnce() -> T) -> T {
+    let start = ProcessTime::now();
+    let result = run();
+    println!("{what}: {:.3} CPU s", start.elapsed().as_secs_f64());
+    result
+}
+
+fn main() {
+    let castle = timed("built-in castle: draw its bricks", demo_model);
+    timed("built-in castle: mesh", || castle.mesh(&MeshOptions::default()));
+    timed("built-in castle: check", || castle.check(&CheckOptions::default()));
+    let Some(library) = mb_testdata::find("ldraw/parts.zip") else { return };
+    for name in ["10214-1-tower-bridge", "10182-1-cafe-corner"] {
+        let Some(path) = mb_testdata::find(&format!("ldraw/models/{name}.mpd")) else { return };
+        let (model, triangles) = timed(&format!("{name}: open the library, read, flatten"), || {
+            let library = PartLibrary::open(&library).expect("a library");
+            let model = Model::read(&path, Some(&library)).expect("a model");
+            let mesh = model.mesh(&MeshOptions::default());
+            (model, mesh.triangles.len())
+        });
+        println!("{name}: {triangles} triangles");
+        let report = timed(&format!("{name}: check"), || model.check(&CheckOptions::default()));
+        if let Ok(report) = report {
+            println!(
+                "{name}: {} parts, {} covered, {} studs gripped, {} groups, {} collisions, stable: {}",
+                report.parts,
+                report.covered_parts,
+                report.connections,
+                report.groups,
+                report.collisions.len(),
+                report.stable
+            );
+        }
+    }
+}

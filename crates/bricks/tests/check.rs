@@ -1,0 +1,155 @@
+//! Connections, collisions and statics with known answers.
+
+use mb_bricks::{CheckOptions, CheckReport, Model, demo_model};
+
+/// Lines of `part x top z quarter-turns` on the grid of studs and plates.
+fn model(lines: &[(&str, f64, i32, f64)]) -> Model {
+    let mut text = String::from("0 test\n");
+    for (part, x, top, z) in lines {
+        text += &format!("1 4 {} {} {} 1 0 0 0 1 0 0 0 1 {part}.dat\n", x * 20.0, -8 * top, z * 20.0);
+    }
+    Model::from_text(&text, "test.ldr", None).unwrap()
+}
+
+fn check(lines: &[(&str, f64, i32, f64)]) -> CheckReport {
+    model(lines).check(&CheckOptions::default()).unwrap()
+}
+
+#[test]
+fn bricks_on_studs_are_connected() {
+    // Full overlap, overlap by one stud row, by a quarter, side by side, one gap.
+    for (x, z, studs) in [(2.0, 1.0, 8), (5.0, 1.0, 2), (5.0, 2.0, 1), (2.0, 2.0, 4), (6.0, 1.0, 0), (7.0, 1.0, 0)] {
+        let found = model(&[("3001", 2.0, 3, 1.0), ("3001", x, 6, z)]).connections();
+        assert_eq!(found.studs.len(), studs, "at {x} {z}");
+        assert!(found.studs.iter().all(|c| (c.stud_brick, c.grip_brick) == (0, 1)));
+    }
+    // A plate too high holds nothing, by 0.1 units and by more.
+    assert_eq!(model(&[("3001", 2.0, 3, 1.0), ("3001", 2.0, 7, 1.0)]).connections().studs.len(), 0);
+}
+
+#[test]
+fn every_drawn_part_with_room_below_grips_the_studs_of_a_plate() {
+    for (number, title) in mb_bricks::drawable_parts() {
+        let alone = model(&[(number, 0.0, 0, 0.0)]);
+        let bounds = alone.info().bbox_ldu.unwrap();
+        let bottom = bounds.max[1];
+        // Put the part on the studs of a large plate, its box on the grid.
+        let text = format!(
+            "1 4 0 {bottom} 0 1 0 0 0 1 0 0 0 1 41539.dat\n1 4 {} 0 {} 1 0 0 0 1 0 0 0 1 {number}.dat\n",
+            -bounds.min[0] - 80.0 + 20.0,
+            -bounds.min[2] - 80.0 + if number == "87087" { 16.0 } else { 20.0 },
+        );
+        let found = Model::from_text(&text, "m.ldr", None).unwrap().connections().studs;
+        assert!(found.iter().any(|c| (c.stud_brick, c.grip_brick) == (0, 1)), "{title} ({number}) grips nothing");
+    }
+}
+
+#[test]
+fn jumpers_and_side_studs_are_found() {
+    let half = model(&[("87580", 1.0, 1, 1.0), ("3005", 1.0, 4, 1.0)]).connections();
+    assert_eq!(half.studs.len(), 1);
+    let tube = model(&[("87580", 1.0, 1, 1.0), ("3003", 1.0, 4, 1.0)]).connections();
+    assert_eq!(tube.studs.len(), 1, "a stud in a tube");
+    // A plate on its side, on the side stud.
+    let side = "1 4 0 0 0 1 0 0 0 1 0 0 0 1 87087.dat\n1 4 0 10 -18 1 0 0 0 0 -1 0 1 0 3024.dat\n";
+    assert_eq!(Model::from_text(side, "m.ldr", None).unwrap().connections().studs.len(), 1);
+}
+
+#[test]
+fn bricks_in_the_same_place_collide_and_neighbours_do_not() {
+    let apart = [("3001", 6.0, 3, 1.0), ("3001", 2.0, 6, 1.0), ("3001", 2.0, 3, 3.0), ("3003", 1.0, 4, 1.0)];
+    for (index, expected) in [(0, None), (1, None), (2, None), (3, Some(2.0..10.0))] {
+        let report = check(&[("3001", 2.0, 3, 1.0), apart[index]]);
+        match (&report.collisions[..], expected) {
+            ([], None) => {}
+            ([only], Some(range)) => assert!(range.contains(&only.depth_mm), "{}", only.depth_mm),
+            (found, _) => panic!("{index}: {found:?}"),
+        }
+    }
+    let twice = check(&[("3001", 2.0, 3, 1.0), ("3001", 2.0, 3, 1.0)]);
+    assert_eq!(twice.collisions.len(), 1);
+    let one_stud = check(&[("3001", 2.0, 3, 1.0), ("3001", 5.0, 3, 1.0)]);
+    assert!((one_stud.collisions[0].depth_mm - 8.0).abs() < 0.3, "{:?}", one_stud.collisions);
+}
+
+#[test]
+fn a_cantilever_tips_where_its_centre_of_mass_leaves_the_foot() {
+    // A 1 x 1 foot under one end of a row: the ground cannot pull, so the longest beam that stands is short.
+    let on_foot = |part: &str, x: f64| check(&[("3003", 1.0, 3, 1.0), (part, x, 4, 1.0)]);
+    // Beam centre at 1.0: balanced; the centre of mass of both moves out with the beam.
+    assert!(on_foot("3034", 1.0).stable);
+    assert!(!on_foot("3832", 5.0).stable);
+    // A counterweight brings it back.
+    let balanced =
+        check(&[("3003", 1.0, 3, 1.0), ("3832", 1.0, 4, 1.0), ("3003", 5.0, 7, 1.0), ("3003", -3.0, 7, 1.0)]);
+    assert!(balanced.stable, "{:?}", balanced.notes);
+    let one_sided =
+        check(&[("3003", 1.0, 3, 1.0), ("3832", 1.0, 4, 1.0), ("3001", 4.0, 7, 1.0), ("3001", 4.0, 10, 1.0)]);
+    assert!(!one_sided.stable);
+}
+
+#[test]
+fn the_tipping_point_is_where_statics_puts_it() {
+    // Two equal plates 1 x 12 (60479) on each other, the lower one on the ground: the upper one may stick out until
+    // the common centre of mass passes the lower one's end, had the clutch no limit.
+    let options = CheckOptions { clutch_n: 1e3, ..CheckOptions::default() };
+    for out in 1..12 {
+        let overhang = f64::from(out);
+        let lines = [("60479", 6.0, 1, 0.5), ("60479", 6.0 + overhang, 2, 0.5)];
+        let report = model(&lines).check(&options).unwrap();
+        // Centre of both: 6 + overhang / 2 from the lower one's free end, which stands up to 12.
+        assert_eq!(report.stable, 6.0 + overhang / 2.0 <= 12.0, "{overhang}: {:?}", report.notes);
+    }
+    for extra in 0..4 {
+        let far = 11.0 + f64::from(extra);
+        let lines = [("60479", 6.0, 1, 0.5), ("60479", 17.0, 2, 0.5), ("3005", far + 10.5, 5, 0.5)];
+        let report = model(&lines).check(&options).unwrap();
+        // The third brick adds its weight outside: over the edge.
+        assert!(!report.stable, "{far}");
+    }
+}
+
+#[test]
+fn loads_grow_with_the_lever_and_pull_bricks_apart() {
+    let hanging = |bricks: i32| {
+        // A 2 x 4 foot weighed down, a long arm held by two studs only, and bricks on its end.
+        let mut lines = vec![("41539", 4.0, 1, 4.0), ("3001", 2.0, 4, 4.0), ("3006", 8.0, 7, 4.0)];
+        for level in 0..bricks {
+            lines.push(("3001", 11.0, 10 + 3 * level, 4.0));
+        }
+        check(&lines)
+    };
+    let load = |report: &CheckReport| report.weakest.as_ref().map(|w| w.load).unwrap_or(f64::INFINITY);
+    let (light, heavy) = (hanging(1), hanging(4));
+    assert!(load(&light) > 0.0 && load(&heavy) > load(&light), "{} {}", load(&light), load(&heavy));
+}
+
+#[test]
+fn loose_bricks_are_told() {
+    let report = check(&[("3001", 2.0, 3, 1.0), ("3001", 2.0, 9, 1.0)]);
+    assert!(!report.connected && !report.stable);
+    assert_eq!(report.loose_parts, [1]);
+    let side_by_side = check(&[("3001", 2.0, 3, 1.0), ("3001", 6.0, 3, 1.0)]);
+    assert!(!side_by_side.connected && side_by_side.stable);
+}
+
+#[test]
+fn bricks_are_put_in_from_a_free_side() {
+    // A roof over a tower with a brick inside: the brick must come before the roof.
+    let report = check(&[("3001", 2.0, 9, 1.0), ("3003", 1.0, 6, 1.0), ("3001", 2.0, 3, 1.0)]);
+    assert_eq!(report.build_order, [2, 1, 0]);
+    assert!(report.buildable);
+}
+
+#[test]
+fn the_castle_stands() {
+    let report = demo_model().check(&CheckOptions::default()).unwrap();
+    assert_eq!(report.collisions, []);
+    assert!(report.connected, "{} groups, loose {:?}", report.groups, report.loose_parts);
+    assert!(report.stable, "{:?}", report.notes);
+    assert!(report.buildable);
+    assert_eq!(report.covered_parts, report.parts);
+    let mut order = report.build_order.clone();
+    order.sort_unstable();
+    assert_eq!(order, (0..report.parts).collect::<Vec<_>>());
+}

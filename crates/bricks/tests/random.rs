@@ -1,0 +1,60 @@
+//! Random models: sound, varied, repeatable.
+
+use std::collections::BTreeSet;
+
+use mb_bricks::{CheckOptions, Model, RandomOptions, RandomProfile, random_model, random_models};
+use mb_job::Silent;
+
+#[test]
+fn a_batch_is_sound_varied_and_repeatable() {
+    let options = RandomOptions { seed: 7, ..RandomOptions::default() };
+    let batch = random_models(&options, 8, &Silent).unwrap();
+    let mut texts = BTreeSet::new();
+    let mut styles = BTreeSet::new();
+    for random in &batch {
+        let report = random.model.check(&CheckOptions::default()).unwrap();
+        assert!(report.connected && report.stable && report.buildable && report.collisions.is_empty());
+        assert!((25..=150).contains(&random.summary.parts));
+        assert!(random.summary.size_mm.iter().all(|&mm| mm <= 250.0));
+        assert!(random.summary.size_mm.iter().any(|&mm| mm >= 80.0));
+        assert_eq!(random.summary.bricks.values().sum::<usize>(), random.summary.parts);
+        assert!(random.model.info().steps > 5);
+        texts.insert(random.model.to_ldraw());
+        styles.insert(random.summary.style);
+        // What is written is what was judged.
+        let copy = Model::from_text(&random.model.to_ldraw(), "copy.ldr", None).unwrap();
+        assert_eq!(copy.bom(), random.model.bom());
+    }
+    assert_eq!(texts.len(), batch.len());
+    assert!(styles.len() > 1);
+    let again = random_model(&options, 3).unwrap();
+    assert_eq!(again.model.to_ldraw(), batch[3].model.to_ldraw());
+}
+
+#[test]
+fn the_number_of_bricks_is_kept() {
+    let options = RandomOptions { bricks: 60, ..RandomOptions::default() };
+    assert_eq!(random_model(&options, 0).unwrap().summary.parts, 60);
+}
+
+#[test]
+fn profiles_are_read_and_bad_ones_explained() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("profile.toml");
+    let read = |text: &str| {
+        std::fs::write(&path, text).unwrap();
+        RandomProfile::read(&path)
+    };
+    let profile = read("max_colors = 2\n[bricks]\n3001 = 1.0\n[styles]\nbridge = 1\n").unwrap();
+    assert_eq!((profile.bricks.len(), profile.styles.len(), profile.max_colors), (1, 1, 2));
+    for (text, expected) in [
+        ("[bricks]\n9999 = 1.0\n", "9999 is none"),
+        ("[bricks]\n3001 = -1.0\n", "negative"),
+        ("[colors]\nred = 1.0\n", "no LDraw code"),
+        ("\nbrick = 3\n", "line 2"),
+        ("min_size_mm = 300.0\n", "sizes"),
+    ] {
+        let message = read(text).unwrap_err().to_string();
+        assert!(message.contains(expected), "{message}");
+    }
+}
