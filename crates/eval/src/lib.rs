@@ -5,6 +5,8 @@
 //! - **Views**: [`evaluate_views`] compares rendered with photographed images (PSNR, SSIM and a [`PerceptualMetric`]).
 //! - **Depth**: [`evaluate_depth`] compares depth maps.
 //! - **Poses**: [`evaluate_poses`] compares camera poses, pairwise, in the object's frame, and after alignment.
+//! - **Tables**: [`PaperTable`] holds the published numbers, [`Table`] sets rows of one's own beside them, [`lint`] finds
+//!   rows that cannot be true.
 //!
 //! Every protocol has a name and a definition in `docs/metrics.md`; a change that moves a score makes a new name. Scores
 //! are the same for any number of threads. What cannot be scored is an error or is named as missing, never a zero.
@@ -15,6 +17,7 @@ mod pairing;
 mod perceptual;
 mod poses;
 mod surface;
+mod table;
 mod views;
 
 pub use depth::{
@@ -28,6 +31,10 @@ pub use surface::{
     SurfaceMean, SurfaceOptions, SurfaceProtocol, SurfaceScores, SurfaceTable, SurfaceTruth, ThresholdIntervals,
     ThresholdScore, distances_to_surface_m, evaluate_surface, evaluate_surface_method, read_sequence_list,
     score_surface, vertex_distances_mm,
+};
+pub use table::{
+    Better, Column, ImpossibleRow, PairedDifference, PaperTable, Row, SOURCE, Table, TableFormat, lint,
+    paired_bootstrap,
 };
 pub use views::{
     ColorImage, SequenceViews, Similarity, VIEWS_PROTOCOL, ViewScore, ViewsOptions, ViewsScores, ViewsTable,

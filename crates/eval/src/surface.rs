@@ -25,7 +25,9 @@ pub use curve::{Curve, CurvePoint};
 pub use distance::{distances_to_surface_m, vertex_distances_mm};
 pub use exact::{Aligned, Confidence95, ExactScores, Interval, ThresholdIntervals};
 pub use input::SurfaceTruth;
+pub(crate) use method::quoted;
 pub use method::{AlignedMean, MissingScore, SurfaceMean, SurfaceTable, evaluate_surface_method, read_sequence_list};
+pub(crate) use score::f1;
 pub use score::{Chamfer, ThresholdScore};
 
 /// How surfaces are scored; a change that moves a score makes a new variant.
@@ -118,10 +120,10 @@ impl SurfaceOptions {
         }
     }
 
-    /// The seed for sampling the ground truth. Differs from the prediction's: equal meshes must not get equal samples,
-    /// or the published protocol would lose the sampling floor that it has.
+    /// The seed for sampling the ground truth: even, the prediction's is odd. Equal meshes must not get equal samples, or
+    /// the published protocol would lose the sampling floor that it has.
     fn truth_seed(&self) -> u64 {
-        self.seed.wrapping_mul(2)
+        self.seed.wrapping_mul(2).wrapping_add(2)
     }
 
     fn prediction_seed(&self) -> u64 {
