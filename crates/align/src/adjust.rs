@@ -8,7 +8,7 @@ use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, Matrix6, Matrix6x3, Point2,
 use rayon::prelude::*;
 
 use crate::contour::twist_about;
-use crate::pnp::{moved, project};
+use crate::pnp_problem::{moved, project};
 
 /// A camera: as the phone had it, after a motion of the scene that undoes the phone's drift.
 #[derive(Debug, Clone, Copy)]

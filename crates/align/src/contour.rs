@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use crate::adjust::CameraTerm;
 use crate::model_edges::{ModelEdges, VisibleSample, view_at};
-use crate::pnp::{moved, project};
+use crate::pnp_problem::{moved, project};
 use crate::profile::{Candidates, MAX_RANGE_PX, Pyramid, candidates};
 
 /// Edge residuals of one frame err together (lighting, play between bricks, the photograph's sharpening), so that a

@@ -12,11 +12,19 @@ use crate::output::{begin_stage, rows};
 use crate::pnp::{Correspondence, PnpError, PnpOptions, PointLayout, PoseEstimate, PosedCamera, estimate_pose};
 
 /// How `align_keypoints` works.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct KeypointOptions {
-    /// The pose estimate.
+    /// The pose estimate. Its drift is that of a phone, and is only assumed where the clicks of several frames do not
+    /// agree without it.
     pub pnp: PnpOptions,
+}
+
+impl Default for KeypointOptions {
+    fn default() -> Self {
+        // A phone's relative poses err by 4.5 mm and 0.6 degrees (Li et al. 2023, table 5).
+        Self { pnp: PnpOptions { drift_deg: 0.6, drift_mm: 4.5, ..PnpOptions::default() } }
+    }
 }
 
 /// What came out, for people and programs.
@@ -37,8 +45,8 @@ pub struct KeypointSummary {
     /// Every clicked point in the file's order.
     pub residuals: Vec<KeypointResidual>,
     /// Covariance of the pose, left perturbation in the world frame, `[rotation; translation]` (rad, m), row-major,
-    /// scaled by the residuals' variance. It takes the phone's poses as exact: errors that all annotated frames share
-    /// are not in it.
+    /// scaled by the residuals' variance. It is conditional on the phone's poses (see `poses_drifted`): errors that all
+    /// annotated frames share are not in it.
     pub covariance: [[f64; 6]; 6],
     /// Standard deviation of the rotation, degrees.
     pub rotation_std_deg: f64,
@@ -48,6 +56,9 @@ pub struct KeypointSummary {
     pub condition: f64,
     /// How the inliers' 3D points lie in space.
     pub layout: PointLayout,
+    /// Whether the frames' clicks only agree if the phone's poses have drifted; residuals are then after a small motion
+    /// of each frame, and the covariance takes the drifts as independent.
+    pub poses_drifted: bool,
     /// The file written.
     pub written: PathBuf,
     /// What deserves a look.
@@ -75,7 +86,8 @@ pub struct KeypointResidual {
 
 /// Computes the object's pose from `annotation/keypoints.json` and writes `alignment/alignment.json`.
 ///
-/// The cameras' poses are taken from `pose/` and their relative poses as exact. Wrong clicks are left out and named in
+/// The cameras' poses are taken from `pose/`, as exact where the clicks of all frames agree to within their noise, and
+/// else as drifted by about [`PnpOptions::drift_mm`] each. Wrong clicks are left out and named in
 /// the warnings. Results of later stages that an earlier run left behind in `alignment/` are removed.
 ///
 /// # Errors
@@ -113,7 +125,7 @@ pub fn align_keypoints(
             point_in_object: k.point_in_object_m,
         })
         .collect();
-    let estimate = estimate_pose(&cameras, &correspondences, &options.pnp).map_err(|e| explain(&path, &e))?;
+    let (estimate, drifted) = estimate(&cameras, &correspondences, &options.pnp).map_err(|e| explain(&path, &e))?;
 
     let written = begin_stage(sequence)?;
     Alignment {
@@ -126,7 +138,29 @@ pub fn align_keypoints(
     }
     .write(&written)?;
     steps.step()?;
-    Ok(summary(&keypoints, &estimate, ids.len(), written))
+    Ok(summary(&keypoints, &estimate, ids.len(), drifted, written))
+}
+
+/// The pose with the cameras' relative poses taken as exact where the clicks bear that out, else as drifted; and which.
+fn estimate(
+    cameras: &[PosedCamera],
+    correspondences: &[Correspondence],
+    options: &PnpOptions,
+) -> Result<(PoseEstimate, bool), PnpError> {
+    let exact =
+        estimate_pose(cameras, correspondences, &PnpOptions { drift_deg: 0.0, drift_mm: 0.0, ..options.clone() });
+    let bears_out = exact.as_ref().is_ok_and(|e| {
+        // Residual lengths of right clicks have a root mean square of the noise times the root of 2.
+        let agreeing = e.inliers.iter().filter(|i| **i).count();
+        e.rms_px <= 1.5 * std::f64::consts::SQRT_2 * options.click_noise_px && 4 * agreeing >= 3 * correspondences.len()
+    });
+    if bears_out || cameras.len() < 2 || options.drift_deg <= 0.0 || options.drift_mm <= 0.0 {
+        return exact.map(|e| (e, false));
+    }
+    match estimate_pose(cameras, correspondences, options) {
+        Ok(drifted) => Ok((drifted, true)),
+        Err(_) => exact.map(|e| (e, false)),
+    }
 }
 
 /// Refuses what no annotator can have clicked.
@@ -178,7 +212,13 @@ fn explain(path: &Path, error: &PnpError) -> Error {
     InputError::new(path, error.to_string()).help(help).into()
 }
 
-fn summary(keypoints: &Keypoints, estimate: &PoseEstimate, frames: usize, written: PathBuf) -> KeypointSummary {
+fn summary(
+    keypoints: &Keypoints,
+    estimate: &PoseEstimate,
+    frames: usize,
+    poses_drifted: bool,
+    written: PathBuf,
+) -> KeypointSummary {
     let residuals: Vec<KeypointResidual> = keypoints
         .keypoints
         .iter()
@@ -230,6 +270,7 @@ fn summary(keypoints: &Keypoints, estimate: &PoseEstimate, frames: usize, writte
         translation_std_mm,
         condition: estimate.condition,
         layout: estimate.layout,
+        poses_drifted,
         written,
         warnings,
     }

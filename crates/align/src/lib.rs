@@ -20,6 +20,7 @@ mod matching;
 mod model_edges;
 mod output;
 mod pnp;
+mod pnp_problem;
 mod profile;
 mod refine;
 mod scale_space;

@@ -2,10 +2,11 @@
 
 use mb_geometry::{Camera, Intrinsics, Object, Rigid3, World};
 use mb_job::rng;
-use nalgebra::{Matrix2x3, Matrix2x6, Matrix3, Matrix6, Point2, Point3, Vector2, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, Point2, Point3, Vector2, Vector3, Vector6};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
+use crate::pnp_problem::Problem;
 use crate::sqpnp::{self, Sighting};
 
 /// A camera whose pose is taken as known.
@@ -38,6 +39,11 @@ pub struct PnpOptions {
     /// Largest root mean square angle between right clicks and the model for which a pose is accepted, degrees. The
     /// default is several times what a phone's drift causes.
     pub max_rms_deg: f64,
+    /// How far each camera's pose may have drifted, as a turn of the scene about the clicked points, degrees (standard
+    /// deviation); 0 takes the poses as exact.
+    pub drift_deg: f64,
+    /// The same as a shift of the scene, millimetres; 0 takes the poses as exact.
+    pub drift_mm: f64,
     /// Random subsets tried in the search for wrong clicks.
     pub subsets: usize,
     /// Seed of the subsets.
@@ -46,7 +52,19 @@ pub struct PnpOptions {
 
 impl Default for PnpOptions {
     fn default() -> Self {
-        Self { click_noise_px: 2.0, max_rms_deg: 2.0, subsets: 300, seed: 0 }
+        Self { click_noise_px: 2.0, max_rms_deg: 2.0, drift_deg: 0.0, drift_mm: 0.0, subsets: 300, seed: 0 }
+    }
+}
+
+impl PnpOptions {
+    /// Information on each camera's drift in units of a click's; none for one camera, whose drift is the object's.
+    fn drift_prior(&self, cameras: usize) -> Option<Matrix6<f64>> {
+        let (rotation_rad, shift_m) = (self.drift_deg.to_radians(), self.drift_mm * 1e-3);
+        if cameras < 2 || rotation_rad <= 0.0 || shift_m <= 0.0 {
+            return None;
+        }
+        let (r, t) = ((self.click_noise_px / rotation_rad).powi(2), (self.click_noise_px / shift_m).powi(2));
+        Some(Matrix6::from_diagonal(&Vector6::new(r, r, r, t, t, t)))
     }
 }
 
@@ -126,7 +144,7 @@ pub struct PoseEstimate {
     /// The pose.
     pub world_from_object: Rigid3<World, Object>,
     /// Covariance, left perturbation in the world frame, `[rotation; translation]` (rad, m), scaled by the residuals'
-    /// variance. It takes the cameras' poses as exact.
+    /// variance. It takes the cameras' poses as exact, or as independently drifted where the options say so.
     pub covariance: Matrix6<f64>,
     /// Standard deviation of the rotation, radians: the root of the trace of its covariance.
     pub rotation_std_rad: f64,
@@ -170,7 +188,8 @@ pub fn estimate_pose(
     correspondences: &[Correspondence],
     options: &PnpOptions,
 ) -> Result<PoseEstimate, PnpError> {
-    let problem = Problem::new(cameras, correspondences);
+    let drift_prior = options.drift_prior(cameras.len());
+    let problem = Problem::new(cameras, correspondences, drift_prior);
     let points = correspondences.len();
     if points < 4 {
         return Err(PnpError::TooFew { found: points });
@@ -183,7 +202,7 @@ pub fn estimate_pose(
         let behind = problem.closest_to_rays(&all).map_or(points, |s| points - s.in_front);
         return Err(PnpError::Behind { behind, points });
     };
-    let residuals = problem.residuals(&pose);
+    let residuals = problem.residuals_without_drift(&pose, &inliers);
     let behind = residuals.iter().filter(|r| r.is_none()).count();
     if 2 * behind > points {
         return Err(PnpError::Behind { behind, points });
@@ -197,10 +216,12 @@ pub fn estimate_pose(
             .iter()
             .map(|c| Correspondence { point_in_object: mirrored(&c.point_in_object), ..*c })
             .collect();
-        let twin = Problem::new(cameras, &mirrored);
+        let twin = Problem::new(cameras, &mirrored, drift_prior);
         if let Some(fit) = twin.best_fit(options) {
-            let (px, mirrored_px) =
-                (truncated_rms(&residuals, limit_px), truncated_rms(&twin.residuals(&fit.pose), limit_px));
+            let (px, mirrored_px) = (
+                truncated_rms(&residuals, limit_px),
+                truncated_rms(&twin.residuals_without_drift(&fit.pose, &fit.inliers), limit_px),
+            );
             if mirrored_px < 0.5 * px {
                 return Err(PnpError::Mirrored { px, mirrored_px });
             }
@@ -210,12 +231,18 @@ pub fn estimate_pose(
         return Err(PnpError::NoAgreement { rms_px, agreeing, points });
     }
     let layout = layout(correspondences, &inliers)?;
-    // Two residuals a point against six parameters; four points leave two degrees of freedom.
-    let freedom = (2 * agreeing - 6) as f64;
-    let sum_sq = rms_px * rms_px * agreeing as f64;
-    let variance_px2 = (sum_sq / freedom).max(1e-12);
+    let Some(equations) = problem.normal_equations(&pose, &inliers) else {
+        return Err(PnpError::NoAgreement { rms_px, agreeing, points });
+    };
+    // Two residuals a point against six parameters, and what the drifts take up.
+    let freedom = (2 * agreeing - 6) as f64 - equations.drift_freedom;
+    let sum_sq = equations.sum_sq;
+    let noise_px2 = options.click_noise_px.powi(2);
+    // The drifts' prior is in units of the click noise, which the residuals may only raise.
+    let least_px2 = if drift_prior.is_some() { noise_px2 } else { 1e-12 };
+    let variance_px2 = (sum_sq / freedom.max(1.0)).max(least_px2);
     if let Some((other, other_sum_sq)) = problem.twin(&pose, &inliers)
-        && (other_sum_sq - sum_sq) / variance_px2.max((0.25 * options.click_noise_px).powi(2)) < TWIN_LIMIT
+        && (other_sum_sq - sum_sq) / variance_px2.max(noise_px2 / 16.0) < TWIN_LIMIT
     {
         return Err(PnpError::Ambiguous {
             rms_px,
@@ -224,7 +251,7 @@ pub fn estimate_pose(
         });
     }
 
-    let normal = problem.normal_equations(&pose, &inliers).map(|n| n.hessian).unwrap_or_else(Matrix6::zeros);
+    let normal = equations.hessian;
     let scale = normal.diagonal().map(|v| 1.0 / v.max(f64::MIN_POSITIVE).sqrt());
     let scaled = Matrix6::from_diagonal(&scale) * normal * Matrix6::from_diagonal(&scale);
     let eigenvalues = scaled.symmetric_eigenvalues();
@@ -313,123 +340,7 @@ struct Fit {
     limit_px: f64,
 }
 
-/// Gauss-Newton's equations for a rotation about the centroid and a shift.
-struct NormalEquations {
-    hessian: Matrix6<f64>,
-    /// `J' r`, with `r` found minus predicted.
-    right: Vector6<f64>,
-    sum_sq: f64,
-}
-
-struct Problem<'a> {
-    cameras: &'a [PosedCamera],
-    cam_from_world: Vec<(Matrix3<f64>, Vector3<f64>)>,
-    correspondences: &'a [Correspondence],
-    sightings: Vec<Sighting>,
-}
-
-impl<'a> Problem<'a> {
-    fn new(cameras: &'a [PosedCamera], correspondences: &'a [Correspondence]) -> Self {
-        let cam_from_world = cameras
-            .iter()
-            .map(|c| c.world_from_cam.inverse())
-            .map(|t| (t.rotation_matrix(), t.translation()))
-            .collect();
-        let sightings = correspondences
-            .iter()
-            .map(|c| {
-                let camera = &cameras[c.camera_idx];
-                let ray = camera.intrinsics.ray(&c.pixel, &camera.world_from_cam);
-                Sighting {
-                    origin_in_world: ray.origin,
-                    direction_in_world: ray.direction,
-                    point_in_object: c.point_in_object,
-                }
-            })
-            .collect();
-        Self { cameras, cam_from_world, correspondences, sightings }
-    }
-
-    /// Mean focal length over the correspondences.
-    fn pixels_per_radian(&self) -> f64 {
-        let sum: f64 = self.correspondences.iter().map(|c| self.cameras[c.camera_idx].intrinsics.fx).sum();
-        sum / self.correspondences.len() as f64
-    }
-
-    fn centroid(&self, pose: &Rigid3<World, Object>, chosen: &[bool]) -> Vector3<f64> {
-        let (mut sum, mut n) = (Vector3::zeros(), 0.0);
-        for (c, _) in self.correspondences.iter().zip(chosen).filter(|(_, chosen)| **chosen) {
-            sum += (*pose * c.point_in_object).coords;
-            n += 1.0;
-        }
-        if n > 0.0 { sum / n } else { sum }
-    }
-
-    fn residuals(&self, pose: &Rigid3<World, Object>) -> Vec<Option<Vector2<f64>>> {
-        let (rotation, translation) = (pose.rotation_matrix(), pose.translation());
-        self.correspondences
-            .iter()
-            .map(|c| {
-                let p_in_world = rotation * c.point_in_object.coords + translation;
-                let (r, t) = &self.cam_from_world[c.camera_idx];
-                let predicted = self.cameras[c.camera_idx].intrinsics.img_from_cam(&Point3::from(r * p_in_world + t));
-                predicted.map(|predicted| c.pixel - predicted)
-            })
-            .collect()
-    }
-
-    /// `None` where a chosen point lies behind its camera.
-    fn normal_equations(&self, pose: &Rigid3<World, Object>, chosen: &[bool]) -> Option<NormalEquations> {
-        let center = self.centroid(pose, chosen);
-        let (rotation, translation) = (pose.rotation_matrix(), pose.translation());
-        let mut sums = NormalEquations { hessian: Matrix6::zeros(), right: Vector6::zeros(), sum_sq: 0.0 };
-        for (c, _) in self.correspondences.iter().zip(chosen).filter(|(_, chosen)| **chosen) {
-            let p_in_world = rotation * c.point_in_object.coords + translation;
-            let (r, t) = &self.cam_from_world[c.camera_idx];
-            let k = &self.cameras[c.camera_idx].intrinsics;
-            let (predicted, jacobian) = project(k, r, t, &p_in_world, &center)?;
-            let residual = c.pixel - predicted;
-            sums.hessian += jacobian.transpose() * jacobian;
-            sums.right += jacobian.transpose() * residual;
-            sums.sum_sq += residual.norm_squared();
-        }
-        Some(sums)
-    }
-
-    /// Levenberg-Marquardt over the chosen correspondences. `None` where the start already has one behind its camera.
-    fn polish(&self, start: &Rigid3<World, Object>, chosen: &[bool]) -> Option<(Rigid3<World, Object>, f64)> {
-        let mut pose = *start;
-        let mut equations = self.normal_equations(&pose, chosen)?;
-        let mut damping = 1e-6;
-        for _ in 0..50 {
-            let mut damped = equations.hessian;
-            for i in 0..6 {
-                damped[(i, i)] *= 1.0 + damping;
-            }
-            let Some(cholesky) = damped.cholesky() else {
-                damping *= 10.0;
-                continue;
-            };
-            let step = cholesky.solve(&equations.right);
-            let next = moved(&pose, &step, &self.centroid(&pose, chosen));
-            match self.normal_equations(&next, chosen) {
-                Some(better) if better.sum_sq <= equations.sum_sq => {
-                    let gain = equations.sum_sq - better.sum_sq;
-                    (pose, equations) = (next, better);
-                    damping = (damping * 0.1).max(1e-9);
-                    if gain <= 1e-12 * equations.sum_sq || equations.sum_sq < 1e-18 {
-                        break;
-                    }
-                }
-                _ => damping *= 10.0,
-            }
-            if damping > 1e9 {
-                break;
-            }
-        }
-        Some((pose, equations.sum_sq))
-    }
-
+impl Problem<'_> {
     fn chosen_sightings(&self, chosen: &[bool]) -> Vec<Sighting> {
         self.sightings.iter().zip(chosen).filter(|(_, chosen)| **chosen).map(|(s, _)| *s).collect()
     }
@@ -457,7 +368,7 @@ impl<'a> Problem<'a> {
         let noise_limit = RAYLEIGH_LIMIT * options.click_noise_px;
         let whole = self.polished_minimum(&all).map(|(pose, _)| pose);
         if let Some(pose) = whole {
-            let residuals = self.residuals(&pose);
+            let residuals = self.residuals_without_drift(&pose, &all);
             let largest = residuals.iter().map(|r| r.map_or(f64::INFINITY, |r| r.norm())).fold(0.0, f64::max);
             // With five points or fewer, leaving one out always leaves an exact or nearly exact fit.
             if largest <= noise_limit || points < 6 {
@@ -508,8 +419,14 @@ impl<'a> Problem<'a> {
             let (polished, sum_sq) = self.polish(&pose, &inliers)?;
             pose = polished;
             let agreeing = inliers.iter().filter(|&&i| i).count();
-            sigma = (sum_sq / (2.0 * agreeing as f64 - 6.0).max(1.0)).sqrt().max(options.click_noise_px);
-            let next = self.within(&pose, RAYLEIGH_LIMIT * sigma);
+            let taken = self.normal_equations(&pose, &inliers)?.drift_freedom;
+            let freedom = 2.0 * agreeing as f64 - 6.0 - taken;
+            sigma = (sum_sq / freedom.max(1.0)).sqrt().max(options.click_noise_px);
+            let next: Vec<bool> = self
+                .residuals_without_drift(&pose, &inliers)
+                .iter()
+                .map(|r| r.is_some_and(|r| r.norm() <= RAYLEIGH_LIMIT * sigma))
+                .collect();
             if next == inliers || next.iter().filter(|&&i| i).count() < 4 {
                 break;
             }
@@ -562,46 +479,6 @@ impl<'a> Problem<'a> {
         let eigen = spread.symmetric_eigen();
         eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned()
     }
-}
-
-/// The pose after a rotation `step[0..3]` about `center` and a shift `step[3..6]`, in the world.
-pub(crate) fn moved<From>(
-    pose: &Rigid3<World, From>,
-    step: &Vector6<f64>,
-    center: &Vector3<f64>,
-) -> Rigid3<World, From> {
-    let turn = nalgebra::UnitQuaternion::from_scaled_axis(step.fixed_rows::<3>(0).into_owned());
-    let shift = step.fixed_rows::<3>(3) + center - turn * center;
-    let mut rotation = turn * pose.rotation();
-    rotation.renormalize();
-    Rigid3::from_parts(rotation, turn * pose.translation() + shift)
-}
-
-/// The pixel of a point, and its derivative with respect to a rotation about `center` and a shift of the point in the
-/// world. `None` behind the camera.
-pub(crate) fn project(
-    k: &Intrinsics,
-    rotation: &Matrix3<f64>,
-    translation: &Vector3<f64>,
-    p_in_world: &Vector3<f64>,
-    center: &Vector3<f64>,
-) -> Option<(Point2<f64>, Matrix2x6<f64>)> {
-    let p = rotation * p_in_world + translation;
-    let pixel = k.img_from_cam(&Point3::from(p))?;
-    let inverse_z = 1.0 / p.z;
-    let pixel_of_cam = Matrix2x3::new(
-        k.fx * inverse_z,
-        0.0,
-        -k.fx * p.x * inverse_z * inverse_z,
-        0.0,
-        k.fy * inverse_z,
-        -k.fy * p.y * inverse_z * inverse_z,
-    );
-    let pixel_of_world = pixel_of_cam * rotation;
-    let mut jacobian = Matrix2x6::zeros();
-    jacobian.fixed_view_mut::<2, 3>(0, 0).copy_from(&(-pixel_of_world * (p_in_world - center).cross_matrix()));
-    jacobian.fixed_view_mut::<2, 3>(0, 3).copy_from(&pixel_of_world);
-    Some((pixel, jacobian))
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! What the pose estimate must recover, and which degenerate inputs it must tell apart.
 
 use super::*;
+use crate::pnp_problem::{moved, project};
 use nalgebra::UnitQuaternion;
 
 const PHONE: Intrinsics = Intrinsics { fx: 1460.0, fy: 1460.0, cx: 962.0, cy: 724.5 };
