@@ -54,33 +54,83 @@ fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64
         })
         .collect();
 
-    // Weights only ever fall. So the heap may keep old, too large ones: an entry is brought up to date when it comes to
-    // the top, and only an entry that stays there is removed.
-    let mut heap: Vec<(f64, u32)> = weights.iter().zip(0..).map(|(&w, i)| (w, i)).collect();
-    for i in (0..count / 2).rev() {
-        sift_down(&mut heap, i);
-    }
+    let mut queue = Queue::new(&weights);
     let mut kept = vec![true; count];
-    let mut left = count;
-    while left > n {
-        let (old, i) = heap[0];
-        let weight = weights[i as usize];
-        if weight < old {
-            heap[0].0 = weight;
-            sift_down(&mut heap, 0);
-            continue;
-        }
+    for _ in n..count {
+        let Some(i) = queue.pop_most_crowded(&weights) else { break };
         kept[i as usize] = false;
-        left -= 1;
         grid.neighbours(i as usize, |j, squared| weights[j] -= crowding(squared));
-        let last = heap.len() - 1;
-        heap.swap(0, last);
-        heap.pop();
-        sift_down(&mut heap, 0);
     }
     let mut survivors: Vec<u32> = order.into_iter().zip(kept).filter(|(_, kept)| *kept).map(|(i, _)| i).collect();
     survivors.sort_unstable();
     survivors.into_iter().map(|i| candidates[i as usize]).collect()
+}
+
+/// Points by crowding, the most crowded first.
+///
+/// Weights only ever fall. So a point may wait under an old, too large weight: it is brought up to date when its turn
+/// comes. Points wait in buckets of equal steps of weight, and only those of the highest bucket are kept in order, in a
+/// small heap that stays in the processor's cache.
+struct Queue {
+    /// Points that waited under a weight of `step * index` and more.
+    buckets: Vec<Vec<u32>>,
+    step: f64,
+    /// Weight and number of the points of bucket `buckets.len()`, largest first.
+    heap: Vec<(f64, u32)>,
+}
+
+impl Queue {
+    fn new(weights: &[f64]) -> Self {
+        let most = weights.iter().copied().fold(0.0, f64::max);
+        let count = (weights.len() / 64).clamp(1, 1 << 14);
+        let mut queue = Self {
+            buckets: vec![Vec::new(); count + 1],
+            step: (most / count as f64).max(f64::MIN_POSITIVE),
+            heap: Vec::new(),
+        };
+        for (i, &weight) in weights.iter().enumerate() {
+            let bucket = queue.bucket_of(weight);
+            queue.buckets[bucket].push(i as u32);
+        }
+        queue
+    }
+
+    fn bucket_of(&self, weight: f64) -> usize {
+        // What rounding pushed below 0 belongs to the lowest bucket: the conversion saturates.
+        (weight / self.step) as usize
+    }
+
+    /// Takes out the point with the largest weight, of equal ones the lowest number.
+    fn pop_most_crowded(&mut self, weights: &[f64]) -> Option<u32> {
+        loop {
+            let Some(&(old, i)) = self.heap.first() else {
+                for i in self.buckets.pop()? {
+                    let weight = weights[i as usize];
+                    match self.bucket_of(weight) {
+                        lower if lower < self.buckets.len() => self.buckets[lower].push(i),
+                        _ => self.heap.push((weight, i)),
+                    }
+                }
+                for at in (0..self.heap.len() / 2).rev() {
+                    sift_down(&mut self.heap, at);
+                }
+                continue;
+            };
+            let weight = weights[i as usize];
+            let bucket = self.bucket_of(weight);
+            if weight < old && bucket >= self.buckets.len() {
+                self.heap[0].0 = weight;
+                sift_down(&mut self.heap, 0);
+                continue;
+            }
+            self.heap.swap_remove(0);
+            sift_down(&mut self.heap, 0);
+            if weight == old {
+                return Some(i);
+            }
+            self.buckets[bucket].push(i);
+        }
+    }
 }
 
 /// Moves the entry at `i` down to its place in a heap whose largest entry is first. Equal weights: lowest index first.

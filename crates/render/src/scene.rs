@@ -118,7 +118,7 @@ impl Scene {
             .enumerate()
             .map(|(index, (middle, radius))| ((*cam_from_frame * *middle).z, *radius, index))
             // A ball that is not finite may still hold triangles that are.
-            .filter(|(z, radius, _)| !(z + radius < 0.0))
+            .filter(|(z, radius, _)| z + radius >= 0.0 || (z + radius).is_nan())
             .map(|(z, radius, index)| (z - radius, index))
             .collect();
         order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));

@@ -66,9 +66,13 @@ impl Prepared {
             for child in 0..2 {
                 let t0 = (f64::from(node.min[axis][child]) - self.origin[axis]) * self.inverse[axis];
                 let t1 = (f64::from(node.max[axis][child]) - self.origin[axis]) * self.inverse[axis];
-                // 0 * infinity (a ray inside a box's plane) is NaN, which min and max ignore.
-                enter[child] = enter[child].max(t0.min(t1));
-                leave[child] = leave[child].min(t0.max(t1) * SLACK);
+                // 0 * infinity is NaN: a ray within the plane of a box's side, which the slab does not bound.
+                let (near, far) = match t0.is_nan() || t1.is_nan() {
+                    true => (f64::NEG_INFINITY, f64::INFINITY),
+                    false => (t0.min(t1), t0.max(t1)),
+                };
+                enter[child] = enter[child].max(near);
+                leave[child] = leave[child].min(far * SLACK);
             }
         }
         std::array::from_fn(|child| if enter[child] <= leave[child] { enter[child] } else { f64::INFINITY })

@@ -118,50 +118,56 @@ pub fn shade<F: Sync>(mesh: &TriangleMesh, view: &View<F>, options: &ShadeOption
     let frame_from_cam = view.cam_from_frame.inverse();
     let lowest = mesh.vertices.iter().map(|p| p.coords.dot(&up)).fold(f64::INFINITY, f64::min);
 
-    // Linear light and opacity of one sample.
-    let sample = |x: usize, y: usize| -> [f32; 4] {
-        let ray = fine_view.intrinsics.ray(&[x as f64, y as f64].into(), &frame_from_cam);
-        let triangle = raster.triangle[(x, y)];
-        if triangle == NO_TRIANGLE {
-            return if options.ground { ground(&sky, &ray, &up, lowest) } else { [0.0; 4] };
+    let pixel = |i: usize| -> [u8; 4] {
+        let (x, y) = (i % view.size.width * samples, i / view.size.width * samples);
+        // Linear colour times opacity, and opacity.
+        let mut sum = [0.0f64; 4];
+        // Light changes slowly along a surface: samples of one pixel on one surface share it.
+        let mut lit: Vec<(Vector3<f64>, f32, f64)> = Vec::new();
+        let mut ground_shadow = None;
+        for sub in 0..samples * samples {
+            let (x, y) = (x + sub % samples, y + sub / samples);
+            let ray = fine_view.intrinsics.ray(&[x as f64, y as f64].into(), &frame_from_cam);
+            let triangle = raster.triangle[(x, y)];
+            if triangle == NO_TRIANGLE {
+                if options.ground {
+                    sum[3] += *ground_shadow.get_or_insert_with(|| ground(&sky, &ray, &up, lowest));
+                }
+                continue;
+            }
+            let z = raster.depth[(x, y)];
+            let p = ray.at(f64::from(z));
+            let surface = Surface::at(mesh, normals.as_deref(), triangle as usize, &p, options.color);
+            let known = lit
+                .iter()
+                .find(|(normal, depth, _)| normal.dot(&surface.flat_normal) > 0.99 && (depth - z).abs() < 0.01 * z);
+            let light = known.map(|(_, _, light)| *light).unwrap_or_else(|| {
+                let facing = |n: Vector3<f64>| if n.dot(&ray.direction) > 0.0 { -n } else { n };
+                let light = sky.light(&p, &facing(surface.flat_normal), &facing(surface.normal));
+                lit.push((surface.flat_normal, z, light));
+                light
+            });
+            for (sum, color) in sum.iter_mut().zip(surface.color) {
+                *sum += color * light;
+            }
+            sum[3] += 1.0;
         }
-        let p = ray.at(f64::from(raster.depth[(x, y)]));
-        let surface = Surface::at(mesh, normals.as_deref(), triangle as usize, &p, options.color);
-        let facing = |n: Vector3<f64>| if n.dot(&ray.direction) > 0.0 { -n } else { n };
-        let light = sky.light(&p, &facing(surface.flat_normal), &facing(surface.normal));
-        let [r, g, b] = surface.color.map(|c| (c * light) as f32);
-        [r, g, b, 1.0]
+        let [r, g, b, opacity] = sum;
+        if opacity == 0.0 {
+            return [0; 4];
+        }
+        let [r, g, b] = [r, g, b].map(|v| srgb_from_linear((v / opacity) as f32));
+        [r, g, b, (opacity / (samples * samples) as f64 * 255.0).round() as u8]
     };
-    let data = (0..view.size.pixels())
-        .into_par_iter()
-        .map(|i| {
-            let (x, y) = (i % view.size.width * samples, i / view.size.width * samples);
-            let mut sum = [0.0f32; 4];
-            for sub in 0..samples * samples {
-                let [r, g, b, a] = sample(x + sub % samples, y + sub / samples);
-                sum = [sum[0] + r * a, sum[1] + g * a, sum[2] + b * a, sum[3] + a];
-            }
-            let [r, g, b, a] = sum;
-            if a == 0.0 {
-                return [0; 4];
-            }
-            let opacity = (a / (samples * samples) as f32 * 255.0).round() as u8;
-            let [r, g, b] = [r / a, g / a, b / a].map(srgb_from_linear);
-            [r, g, b, opacity]
-        })
-        .collect();
+    let data = (0..view.size.pixels()).into_par_iter().map(pixel).collect();
     Image::from_data(view.size, data).expect("one value a pixel")
 }
 
-/// The shadow on the ground: black, as opaque as light is missing.
-fn ground(sky: &Sky, ray: &mb_geometry::Ray, up: &Vector3<f64>, lowest: f64) -> [f32; 4] {
+/// Opacity of the black shadow on the ground: the share of light that is missing.
+fn ground(sky: &Sky, ray: &mb_geometry::Ray, up: &Vector3<f64>, lowest: f64) -> f64 {
     let towards = ray.direction.dot(up);
     let t = (lowest - ray.origin.coords.dot(up)) / towards;
-    if !(towards < 0.0 && t > 0.0) {
-        return [0.0; 4];
-    }
-    let missing = sky.shadow(&ray.at(t), up);
-    [0.0, 0.0, 0.0, (0.75 * missing) as f32]
+    if towards < 0.0 && t > 0.0 { 0.75 * sky.shadow(&ray.at(t), up) } else { 0.0 }
 }
 
 /// What is known of a point on the mesh.
