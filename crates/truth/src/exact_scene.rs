@@ -6,6 +6,9 @@ use mb_job::{InputError, Result};
 use mb_mesh::TriangleMesh;
 use mb_render::{Raster, Scene, View};
 
+/// Longer models are refused: their unit is not the metre.
+const MAX_MODEL_M: f64 = 20.0;
+
 /// The aligned model of a sequence with its cameras.
 pub struct ExactScene {
     /// The model, world frame, metres.
@@ -28,7 +31,7 @@ impl ExactScene {
     /// Places the sequence's model by a given alignment.
     ///
     /// # Errors
-    /// The sequence has no model, or it is malformed or without triangles.
+    /// The sequence has no model, or it is malformed, without triangles or longer than 20 m.
     pub fn with_alignment(sequence: &Sequence, alignment: &Alignment) -> Result<Self> {
         let path = sequence.model_mesh_path();
         if !path.exists() {
@@ -40,6 +43,13 @@ impl ExactScene {
         if mesh.triangles.is_empty() {
             return Err(InputError::new(path, "the model has no triangles").into());
         }
+        let longest_m = mesh.bounds().extent().max();
+        // NaN is refused as well.
+        if !longest_m.is_finite() || longest_m > MAX_MODEL_M {
+            return Err(InputError::new(path, format!("the model is {longest_m:.0} m long"))
+                .help("The file must be in metres; this one seems to hold millimetres or LDraw units")
+                .into());
+        }
         let mesh = mesh.transformed(&alignment.world_from_object);
         let scene = Scene::new(&mesh);
         Ok(Self { mesh, frames: sequence.aligned_frames(alignment), size: sequence.image_size(), scene })
@@ -50,7 +60,7 @@ impl ExactScene {
         View { intrinsics: frame.intrinsics, size: self.size, cam_from_frame: frame.world_from_cam.inverse() }
     }
 
-    /// Exact depth and triangle ids of a frame, at the photographs' size.
+    /// Exact depth and triangle ids of a frame, at the photographs' size: `gt_depth/` before it is rounded to millimetres.
     pub fn render(&self, frame: &Frame) -> Raster {
         self.scene.render(&self.view(frame))
     }

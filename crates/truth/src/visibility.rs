@@ -14,11 +14,11 @@ const BEHIND_SURFACE_M: f64 = 0.010;
 /// More voxels than this are refused.
 const MAX_VOXELS: f64 = 2e8;
 
-/// An empty volume around `bounds_in_world`.
+/// A volume around `bounds_in_world` and `margin_m` more on every side, in which nothing is seen yet.
 ///
 /// # Errors
 /// The volume would be too large.
-pub(crate) fn empty_volume(bounds_in_world: &Aabb, margin_m: f64, voxel_size_m: f64) -> Result<VisibilityVolume> {
+pub fn empty_volume(bounds_in_world: &Aabb, margin_m: f64, voxel_size_m: f64) -> Result<VisibilityVolume> {
     let bounds = bounds_in_world.grown(margin_m);
     let counts = bounds.extent().map(|side| (side / voxel_size_m).ceil() + 1.0);
     if counts.product() > MAX_VOXELS {
@@ -39,7 +39,7 @@ pub(crate) fn empty_volume(bounds_in_world: &Aabb, margin_m: f64, voxel_size_m: 
 
 /// Marks the voxels that one frame sees: those whose centre falls on a pixel without surface (free up to infinity), or
 /// lies no more than 10 mm behind the surface there.
-pub(crate) fn observe(volume: &mut VisibilityVolume, depth: &DepthImage, view: &View<World>) {
+pub fn observe(volume: &mut VisibilityVolume, depth: &DepthImage, view: &View<World>) {
     let [_, ny, nz] = volume.resolutions;
     let voxel = volume.voxel_size_m;
     let origin = volume.min_pt_in_world;
