@@ -26,7 +26,7 @@ const DOTS: (usize, usize) = (28, 21);
 /// Standard deviation of a dot's momentary error, metres, at any indoor distance.
 const JITTER_M: f64 = 0.003;
 /// Amplitude of errors that belong to the surface, metres, and their size in space.
-const SURFACE_M: f64 = 0.0035;
+const SURFACE_M: f64 = 0.004;
 const SURFACE_SIZE_M: f32 = 0.04;
 /// Range beyond which a dot returns nothing.
 const RANGE_M: f64 = 5.0;
@@ -64,7 +64,7 @@ pub(crate) fn measure(
     let guide = shrink(photo, size);
     let mut rng = rng(seed, streams::LIDAR + frame);
     // The scale of a frame is off by a little, as a whole.
-    let frame_scale = 1.0 + 0.003 * normal(&mut rng);
+    let frame_scale = 1.0 + 0.004 * normal(&mut rng);
 
     let (columns, rows) = if size.width >= size.height { DOTS } else { (DOTS.1, DOTS.0) };
     let pitch = (size.width as f64 / columns as f64, size.height as f64 / rows as f64);

@@ -61,11 +61,11 @@ impl Planks {
         let tone = unit(hash(strip as i32, piece as i32, salt ^ 0x55));
         let own = hash(strip as i32, piece as i32, salt ^ 0x77);
         // Long fibres at two widths, and dark pores as short strokes.
-        let (fibre_kept, pore_kept) = (kept(0.0008, pixel_m), kept(0.0005, pixel_m));
+        let (fibre_kept, pore_kept) = (kept(0.0006, pixel_m), kept(0.0005, pixel_m));
         let mut shade = 0.30 * tone - 0.15;
         if fibre_kept > 0.0 {
-            let fibre = noise(x * 16.0, y * 1250.0, own) + noise(x * 26.0, y * 2700.0, own ^ 8);
-            shade += self.grain * fibre_kept * 0.85 * (fibre - 1.0);
+            let fibre = noise(x * 20.0, y * 2100.0, own) + noise(x * 34.0, y * 4300.0, own ^ 8);
+            shade += self.grain * fibre_kept * 1.1 * (fibre - 1.0);
         }
         if pore_kept > 0.0 {
             let stroke = noise(x * 110.0, y * 3000.0, own ^ 1);
@@ -139,8 +139,8 @@ pub(crate) fn table(kind: Table, (x, y): (f32, f32), pixel_m: f32, half_extent_m
             let planks = Planks {
                 width_m: 0.019,
                 length_m: 0.33,
-                light: Vec3::new(0.72, 0.55, 0.37),
-                dark: Vec3::new(0.34, 0.19, 0.085),
+                light: Vec3::new(0.72, 0.58, 0.43),
+                dark: Vec3::new(0.34, 0.21, 0.11),
                 grain: 0.8,
                 nodes: true,
             };
