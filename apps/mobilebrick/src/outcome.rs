@@ -19,12 +19,10 @@ pub struct Outcome {
 impl Outcome {
     /// A result with its text; the warnings are those of the document, if it has a list `warnings` of sentences.
     pub fn new(document: &impl Serialize, text: impl Into<String>) -> Result<Self, Error> {
-        let document =
-            serde_json::to_value(document).map_err(|e| Error::Failed(format!("the result is no JSON document: {e}")))?;
+        let document = serde_json::to_value(document)
+            .map_err(|e| Error::Failed(format!("the result is no JSON document: {e}")))?;
         let warnings = document.get("warnings").and_then(|w| w.as_array()).into_iter().flatten();
-        let warnings = warnings
-            .map(|w| w.as_str().map_or_else(|| w.to_string(), str::to_owned))
-            .collect();
+        let warnings = warnings.map(|w| w.as_str().map_or_else(|| w.to_string(), str::to_owned)).collect();
         Ok(Self { document, text: text.into(), warnings })
     }
 

@@ -76,6 +76,21 @@ impl<P> Image<P> {
     }
 }
 
+impl<P: Copy> Image<P> {
+    /// The image turned clockwise by `quarter_turns` times 90 degrees, for displays: published photographs lie on
+    /// their side.
+    #[must_use]
+    pub fn rotated_clockwise(&self, quarter_turns: usize) -> Self {
+        let ImageSize { width, height } = self.size;
+        match quarter_turns % 4 {
+            0 => self.clone(),
+            1 => Self::from_fn(ImageSize::new(height, width), |x, y| self[(y, height - 1 - x)]),
+            2 => Self::from_fn(self.size, |x, y| self[(width - 1 - x, height - 1 - y)]),
+            _ => Self::from_fn(ImageSize::new(height, width), |x, y| self[(width - 1 - y, x)]),
+        }
+    }
+}
+
 impl<P: Clone> Image<P> {
     /// An image of one value.
     pub fn filled(size: ImageSize, value: P) -> Self {
@@ -96,5 +111,18 @@ impl<P> std::ops::IndexMut<(usize, usize)> for Image<P> {
     fn index_mut(&mut self, (x, y): (usize, usize)) -> &mut P {
         debug_assert!(x < self.size.width);
         &mut self.data[y * self.size.width + x]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_quarter_turn_clockwise_brings_the_left_column_to_the_top() {
+        let image = Image::from_data(ImageSize::new(3, 2), vec![1, 2, 3, 4, 5, 6]).unwrap();
+        assert_eq!(image.rotated_clockwise(1).data(), [4, 1, 5, 2, 6, 3]);
+        assert_eq!(image.rotated_clockwise(2).data(), [6, 5, 4, 3, 2, 1]);
+        assert_eq!(image.rotated_clockwise(3).rotated_clockwise(1), image);
     }
 }

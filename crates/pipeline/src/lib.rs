@@ -1,7 +1,15 @@
-//! Whole jobs over the crates below: reports and the demo.
+//! Whole jobs over the crates below: a model becomes a capture, a sequence becomes a report, and the demo runs every
+//! stage after the other.
+//!
+//! Each stage reads and writes documented files, so any of them can be rerun or replaced alone; this crate only
+//! puts them in order.
 
+mod demo;
 mod model_capture;
 mod report;
+mod scene_report;
 
+pub use demo::{DemoOptions, DemoSummary, demo};
 pub use model_capture::{ModelCapture, simulate_model};
 pub use report::{ColorScale, Curves, Gallery, Picture, Report, Stage, Table};
+pub use scene_report::{Scored, scene_report};

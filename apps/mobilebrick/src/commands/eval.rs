@@ -111,8 +111,7 @@ impl Surface {
         };
         if let (Some(method), Some(root), Some(list), Some(out)) = (self.method, self.root, self.list, self.out) {
             let list = read_sequence_list(&list)?;
-            let table =
-                evaluate_surface_method(&method, &self.meshes.join(&method), &root, &list, &options, terminal)?;
+            let table = evaluate_surface_method(&method, &self.meshes.join(&method), &root, &list, &options, terminal)?;
             table.write(&out)?;
             let mut text = format!("{method}: {} of {} sequences scored\n", table.sequences.len(), list.len());
             if let Some(mean) = &table.mean {
@@ -174,10 +173,8 @@ impl Views {
         let options = ViewsOptions { hold_out: self.hold_out, masks: self.masks.clone() };
         let scores = evaluate_views(&self.folders.gt, &self.folders.pred, &options, None, terminal)?;
         let lpips = scores.lpips.map_or_else(|| "no weights given".to_owned(), |v| format!("{v:.4}"));
-        let text = format!(
-            "{} images: PSNR {:.2} dB, SSIM {:.4}, LPIPS {lpips}",
-            scores.images, scores.psnr, scores.ssim
-        );
+        let text =
+            format!("{} images: PSNR {:.2} dB, SSIM {:.4}, LPIPS {lpips}", scores.images, scores.psnr, scores.ssim);
         Outcome::new(&scores, text)
     }
 }

@@ -3,6 +3,7 @@
 
 mod align;
 mod capture;
+mod demo;
 mod eval;
 mod model;
 mod parts;
@@ -21,6 +22,8 @@ use crate::terminal::Terminal;
 /// The stages, in the order in which they are run.
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    /// Everything below on a built-in model; ends with a report page
+    Demo(demo::Demo),
     /// Brick models: LDraw and Studio files, built-in bricks
     #[command(subcommand)]
     Model(model::Model),
@@ -44,6 +47,7 @@ impl Command {
     /// Runs the subcommand.
     pub fn run(self, terminal: &Terminal) -> Result<Outcome> {
         match self {
+            Self::Demo(c) => c.run(terminal),
             Self::Model(c) => c.run(terminal),
             Self::Capture(c) => c.run(terminal),
             Self::Align(c) => c.run(terminal),

@@ -81,10 +81,7 @@ fn install(source: &Path) -> Result<Outcome> {
     let target = installed_path()?;
     let bytes = std::fs::read(source).map_err(|e| InputError::unreadable(source, &e))?;
     mb_job::write_atomic(&target, &bytes)?;
-    Outcome::new(
-        &json!({ "path": target, "parts": parts }),
-        format!("installed {parts} parts as {}", target.display()),
-    )
+    Outcome::new(&json!({ "path": target, "parts": parts }), format!("installed {parts} parts as {}", target.display()))
 }
 
 fn verify(given: Option<&Path>) -> Result<Outcome> {
