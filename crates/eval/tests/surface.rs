@@ -245,7 +245,8 @@ fn golden_scores_pin_the_protocols() {
         };
         let found = score_box(dent, &options).unwrap();
         let rounded = |v: f64| format!("{v:.9}");
-        let mut numbers = vec![rounded(found.icp.fitness), rounded(found.chamfer.chamfer_mm), rounded(found.curve.f1_auc)];
+        let mut numbers =
+            vec![rounded(found.icp.fitness), rounded(found.chamfer.chamfer_mm), rounded(found.curve.f1_auc)];
         numbers.extend(found.thresholds.iter().flat_map(|t| [rounded(t.accuracy), rounded(t.recall), rounded(t.f1)]));
         if let Some(exact) = &found.exact {
             let interval = exact.confidence_95.chamfer_mm;
