@@ -190,3 +190,14 @@ fn what_is_no_number_is_not_seen() {
     let empty = Scene::new(&TriangleMesh::default()).depth(&view([0.0; 6]));
     assert!(empty.data().iter().all(|&z| z == 0.0));
 }
+
+/// Bricks of a real model: slivers, T-junctions, coplanar touching walls, open parts.
+#[test]
+fn a_brick_model_agrees_from_all_around() {
+    let Some(path) = mb_testdata::find("official_scorer/wedge/mesh/cad_mesh.ply") else { return };
+    let mesh = mb_mesh::read_mesh(path).unwrap();
+    for i in 0..4 {
+        let view: ObjectView = mb_render::three_quarter_view(&mesh.bounds(), &Vector3::y(), SIZE, f64::from(i), 0.4);
+        assert_eq!(unexplained(&mesh, &view), vec![], "view {i}");
+    }
+}
