@@ -1,5 +1,7 @@
 //! The check of a capture on a real RGB-D recording, and on the same recording spoilt.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on should panic")]
+
 use std::path::Path;
 
 use mb_capture::{

@@ -1,5 +1,7 @@
 //! Importers on real captures, and exports that come back as they went.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on should panic")]
+
 use std::path::Path;
 
 use mb_capture::{CaptureFormat, ExportFormat, FrameId, ImportOptions, ImportSummary, Sequence, export, import};
