@@ -169,7 +169,12 @@ pub fn align_bundle(sequence: &Sequence, options: &BundleOptions, progress: &dyn
             let image = sequence.read_image(frame)?;
             let features = detect_features(
                 &image,
-                &FeatureOptions { upsample: false, most: options.features, ..FeatureOptions::default() },
+                // Small photographs have few features unless they are enlarged.
+                &FeatureOptions {
+                    upsample: size.pixels() < 2_000_000,
+                    most: options.features,
+                    ..FeatureOptions::default()
+                },
             );
             let track = TrackFrame {
                 intrinsics: frame.intrinsics,

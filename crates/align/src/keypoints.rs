@@ -147,19 +147,19 @@ fn estimate(
     correspondences: &[Correspondence],
     options: &PnpOptions,
 ) -> Result<(PoseEstimate, bool), PnpError> {
+    // What no pose explains with exact cameras is no matter of drift.
     let exact =
-        estimate_pose(cameras, correspondences, &PnpOptions { drift_deg: 0.0, drift_mm: 0.0, ..options.clone() });
-    let bears_out = exact.as_ref().is_ok_and(|e| {
-        // Residual lengths of right clicks have a root mean square of the noise times the root of 2.
-        let agreeing = e.inliers.iter().filter(|i| **i).count();
-        e.rms_px <= 1.5 * std::f64::consts::SQRT_2 * options.click_noise_px && 4 * agreeing >= 3 * correspondences.len()
-    });
+        estimate_pose(cameras, correspondences, &PnpOptions { drift_deg: 0.0, drift_mm: 0.0, ..options.clone() })?;
+    // Residual lengths of right clicks have a root mean square of the noise times the root of 2.
+    let noise_rms_px = std::f64::consts::SQRT_2 * options.click_noise_px;
+    let agreeing = exact.inliers.iter().filter(|i| **i).count();
+    let bears_out = exact.rms_px <= 1.5 * noise_rms_px && 4 * agreeing >= 3 * correspondences.len();
     if bears_out || cameras.len() < 2 || options.drift_deg <= 0.0 || options.drift_mm <= 0.0 {
-        return exact.map(|e| (e, false));
+        return Ok((exact, false));
     }
     match estimate_pose(cameras, correspondences, options) {
         Ok(drifted) => Ok((drifted, true)),
-        Err(_) => exact.map(|e| (e, false)),
+        Err(_) => Ok((exact, false)),
     }
 }
 

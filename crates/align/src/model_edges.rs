@@ -5,6 +5,7 @@ use mb_job::rng;
 use mb_mesh::TriangleMesh;
 use mb_render::{NO_TRIANGLE, Raster, Scene, View};
 use nalgebra::{Point2, Point3, Unit, Vector2, Vector3};
+use rand::RngExt;
 use rand::seq::SliceRandom;
 
 /// Edges whose faces meet at less than this angle are flat: an artefact of the triangulation.
@@ -71,11 +72,13 @@ impl ModelEdges {
             .map(|faces| (faces[0].1, faces[0].2))
             .collect();
         edges.shuffle(&mut rng(seed, 0));
+        let mut lots = rng(seed, 2);
         let mut samples = Vec::new();
         for (edge, &(a, b)) in edges.iter().enumerate() {
             let (a, b) = (mesh.vertices[a as usize], mesh.vertices[b as usize]);
             let Some(direction) = Unit::try_new(b - a, 1e-9) else { continue };
-            let count = ((b - a).norm() / SPACING_M).ceil().clamp(1.0, 1000.0) as usize;
+            // Short edges are drawn by lot, so that finely modelled parts have no more samples than their length's worth.
+            let count = ((b - a).norm() / SPACING_M + lots.random::<f64>()).floor().min(1000.0) as usize;
             for i in 0..count {
                 let along = (i as f64 + 0.5) / count as f64;
                 samples.push(EdgeSample { point_in_object: a + (b - a) * along, direction, edge: edge as u32 });

@@ -220,23 +220,64 @@ pub fn align_refine(sequence: &Sequence, options: &RefineOptions, progress: &dyn
 const PASSES: [(usize, usize, usize); 4] = [(3, 10, 6), (2, 7, 4), (1, 6, 4), (0, 5, 4)];
 const LEVELS: usize = PASSES.len() + 1;
 
-/// The level at which the shorter side is about 150 pixels, at most 3.
+/// The level at which the shorter side is at least 80 pixels, at most 3.
 fn coarsest_level(shorter_side: usize) -> usize {
-    (0..=3).rev().find(|level| shorter_side >> level >= 150).unwrap_or(0)
+    (0..=3).rev().find(|level| shorter_side >> level >= 80).unwrap_or(0)
+}
+
+/// Confidence after the coarsest pass from which the start is taken as good.
+const GOOD_START: f64 = 0.35;
+
+/// Where the coarsest pass ends is kept if the edges agree there; else it is repeated from starts around (1 cm along and
+/// 4 degrees about each axis), and the one with the best agreement is kept.
+fn coarsest_pass(fit: &mut ContourFit, coarsest: usize) {
+    let start = fit.world_from_object;
+    let mut twists = vec![Vector6::zeros()];
+    for axis in 0..6 {
+        for sign in [1.0, -1.0] {
+            let mut twist = Vector6::zeros();
+            twist[axis] = sign * if axis < 3 { 4f64.to_radians() } else { 0.01 };
+            twists.push(twist);
+        }
+    }
+    let center = fit.center();
+    let mut best = (f64::NEG_INFINITY, start, Vec::new());
+    for twist in twists {
+        fit.world_from_object = motion_about(&twist, &center) * start;
+        fit.frames.iter_mut().for_each(|f| f.drift = Rigid3::identity());
+        for (level, range_px, repetitions) in PASSES.into_iter().filter(|pass| pass.0 == coarsest) {
+            pass(fit, level, range_px.max(10), repetitions);
+        }
+        let (agreement, chance) = fit.agreement(coarsest.saturating_sub(1), AGREES_PX);
+        let confidence = (agreement - chance) / (1.0 - chance).max(1e-9);
+        if confidence > best.0 {
+            best = (confidence, fit.world_from_object, fit.frames.iter().map(|f| f.drift).collect());
+        }
+        if confidence >= GOOD_START {
+            break;
+        }
+    }
+    fit.world_from_object = best.1;
+    fit.frames.iter_mut().zip(best.2).for_each(|(f, drift)| f.drift = drift);
+}
+
+fn pass(fit: &mut ContourFit, level: usize, range_px: usize, repetitions: usize) {
+    for repetition in 0..repetitions {
+        let observed = fit.observe(level, range_px);
+        // Far edges count at first, near ones in the end.
+        let share = 1.0 - repetition as f64 / repetitions as f64;
+        let limit_px = (range_px as f64 * share).max(AGREES_PX);
+        for _ in 0..4 {
+            fit.step(&observed, limit_px);
+        }
+    }
 }
 
 fn coarse_to_fine(fit: &mut ContourFit, coarsest: usize, steps: &Steps) -> Result<()> {
+    coarsest_pass(fit, coarsest);
     for (level, range_px, repetitions) in PASSES {
-        if level <= coarsest {
-            for repetition in 0..repetitions {
-                let observed = fit.observe(level, range_px);
-                // Far edges count at first, near ones in the end.
-                let share = 1.0 - repetition as f64 / repetitions as f64;
-                let limit_px = (range_px as f64 * share).max(AGREES_PX);
-                for _ in 0..4 {
-                    fit.step(&observed, limit_px);
-                }
-            }
+        if level < coarsest {
+            pass(fit, level, range_px, repetitions);
         }
         steps.step()?;
     }
