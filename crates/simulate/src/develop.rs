@@ -21,11 +21,11 @@ pub(crate) struct Development {
 /// Standard deviation of the lens blur with the phone's own smoothing, pixels of a 1920-pixel-wide photograph.
 const BLUR_PX: f32 = 0.5;
 /// Strength of the phone's sharpening: it adds this share of what a blur of [`SHARPEN_PX`] removes.
-const SHARPEN: f32 = 0.7;
+const SHARPEN: f32 = 1.0;
 const SHARPEN_PX: f32 = 1.1;
 /// Noise after the phone's denoising: variance is `READ^2 + SHOT * signal`, signal 1 is white.
-const READ: f32 = 0.0018;
-const SHOT: f32 = 0.000_03;
+const READ: f32 = 0.0028;
+const SHOT: f32 = 0.000_07;
 /// Light that the corners of the frame lose.
 const VIGNETTE: f32 = 0.10;
 
