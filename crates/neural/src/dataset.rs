@@ -117,6 +117,9 @@ impl View {
     }
 }
 
+/// An image in memory: colours, how much of each pixel the object covers (in 255ths, where known), and its camera.
+pub type Photograph = (RgbImage, Option<Image<u8>>, Intrinsics, Rigid3<World, Camera>);
+
 /// Photographs, cameras and the region of interest: all that training reads.
 #[derive(Debug, Clone)]
 pub struct RayDataset {
@@ -186,10 +189,7 @@ impl RayDataset {
     ///
     /// # Errors
     /// As [`RayDataset::open`].
-    pub fn from_images(
-        images: Vec<(RgbImage, Option<Image<u8>>, Intrinsics, Rigid3<World, Camera>)>,
-        hold_out_every: usize,
-    ) -> Result<Self> {
+    pub fn from_images(images: Vec<Photograph>, hold_out_every: usize) -> Result<Self> {
         let views = images
             .into_iter()
             .enumerate()

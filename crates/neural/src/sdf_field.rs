@@ -66,6 +66,27 @@ pub struct SdfFieldOptions {
     pub initial_radius: f32,
 }
 
+impl SdfFieldOptions {
+    /// The networks of the paper (Wang et al. 2021 and its code, `confs/wmask.conf`): distance 8 x 256 with softplus of
+    /// sharpness 100, skip at layer 4, 6 octaves, 256 features; colour 4 x 256 with 4 octaves of the direction; both
+    /// with normalised weights; a ball of radius 0.5 at the start.
+    pub fn paper() -> Self {
+        Self {
+            position: PositionEncoding::Frequencies(6),
+            direction: DirectionEncoding::Frequencies(4),
+            width: 256,
+            hidden: 8,
+            skip: Some(4),
+            features: 256,
+            softplus: 100.0,
+            color_width: 256,
+            color_hidden: 4,
+            weight_norm: true,
+            initial_radius: 0.5,
+        }
+    }
+}
+
 /// The field.
 #[derive(Debug, Clone)]
 pub struct SdfField {
@@ -415,6 +436,17 @@ impl SdfField {
 mod tests {
     use super::*;
     use rand::RngExt;
+
+    #[test]
+    fn the_papers_networks_have_the_papers_sizes() {
+        // PyTorch's count with weight normalisation: weights, biases, and a length for each output.
+        let count = |layers: &[(usize, usize)]| layers.iter().map(|(i, o)| i * o + 2 * o).sum::<usize>();
+        let wide = (256, 256);
+        let sdf = [(39, 256), wide, wide, (256, 217), wide, wide, wide, wide, (256, 257)];
+        let color = [(289, 256), wide, wide, wide, (256, 3)];
+        let field = SdfField::new(SdfFieldOptions::paper(), &mut mb_job::rng(0, 0));
+        assert_eq!(field.parameter_count(), count(&sdf) + count(&color));
+    }
 
     /// The whole chain with a loss on distance, normal and colour, by finite differences of the parameters.
     #[test]
