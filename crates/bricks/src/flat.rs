@@ -66,8 +66,8 @@ impl Shapes {
         &self.of_file[&id]
     }
 
-    pub fn map(&mut self, mut change: impl FnMut(&mut PartShape)) {
-        self.of_file.values_mut().for_each(|shape| change(shape));
+    pub fn map(&mut self, change: impl FnMut(&mut PartShape)) {
+        self.of_file.values_mut().for_each(change);
     }
 
     /// Every brick, then the polygons that belong to none.

@@ -7,7 +7,10 @@
 //! - [`Model::info`]: the figures and the parts list;
 //! - [`Model::mesh`]: every triangle in the object frame (metres, y up), coloured, with the index of its brick;
 //! - [`Model::instances`], [`Model::occurrences`], [`Model::files`]: bricks, submodels, steps, for instructions;
-//! - [`Model::write_self_contained`]: a copy that needs no library.
+//! - [`Model::write_self_contained`]: a copy that needs no library;
+//! - [`Model::connections`] and [`Model::check`]: which brick holds which, collisions, equilibrium, a building order;
+//! - [`random_models`]: seeded models that can be built and stand; [`demo_model`]: the built-in castle;
+//! - [`external_only`]: what of a mesh can be seen from outside.
 //!
 //! ```
 //! let text = "0 A tower\n1 4 0 0 0 1 0 0 0 1 0 0 0 1 3001.dat\n0 STEP\n1 15 0 -24 0 1 0 0 0 1 0 0 0 1 3001.dat\n";

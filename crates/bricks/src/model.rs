@@ -28,7 +28,7 @@ pub struct PartInstance {
 }
 
 /// One use of a submodel; the first is the model itself.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Occurrence {
     /// Which file.
     pub file: FileId,
@@ -199,7 +199,7 @@ impl Placing<'_> {
     fn submodel(&mut self, occurrence: Occurrence) -> Result<()> {
         let index = self.occurrences.len();
         let file = &self.files[occurrence.file.index()];
-        self.occurrences.push(occurrence.clone());
+        self.occurrences.push(occurrence);
         if file.kind != FileKind::Model {
             // A part opened as a model.
             self.instances.push(PartInstance {

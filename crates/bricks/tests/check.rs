@@ -1,6 +1,8 @@
 //! Connections, collisions and statics with known answers.
 
-use mb_bricks::{CheckOptions, CheckReport, Model, demo_model};
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use mb_bricks::{CheckOptions, CheckReport, MeshOptions, Model, demo_model, external_only};
 
 /// Lines of `part x top z quarter-turns` on the grid of studs and plates.
 fn model(lines: &[(&str, f64, i32, f64)]) -> Model {
@@ -152,4 +154,22 @@ fn the_castle_stands() {
     let mut order = report.build_order.clone();
     order.sort_unstable();
     assert_eq!(order, (0..report.parts).collect::<Vec<_>>());
+}
+
+#[test]
+fn the_outside_of_a_stack_has_no_studs_between_its_bricks() {
+    let mesh = model(&[("3001", 2.0, 3, 1.0), ("3001", 2.0, 6, 1.0)]).mesh(&MeshOptions::default());
+    let (outside, summary) = external_only(&mesh);
+    assert_eq!(outside.triangles.len(), summary.kept);
+    assert!((0.1..0.9).contains(&summary.removed_area), "{summary:?}");
+    // The studs of the lower brick are hidden in the upper one; the walls around them stay.
+    let part_above = |mesh: &mb_mesh::TriangleMesh, part: u32, height: f64| {
+        let parts = mesh.triangle_parts.as_ref().unwrap();
+        (0..mesh.triangles.len()).any(|t| parts[t] == part && mesh.triangle(t).iter().all(|p| p.y > height))
+    };
+    assert!(part_above(&mesh, 0, 0.0097) && !part_above(&outside, 0, 0.0097));
+    assert!(part_above(&outside, 1, 0.0193));
+    let (size, outer) = (mesh.bounds(), outside.bounds());
+    assert!((size.min - outer.min).norm() < 1e-12 && (size.max - outer.max).norm() < 1e-12);
+    assert_eq!(outside.triangle_colors.unwrap().len(), summary.kept);
 }

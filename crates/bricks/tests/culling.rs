@@ -1,5 +1,7 @@
 //! Back-face culling statements: every triangle of a mesh faces outwards, whatever the file did to it.
 
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
 use mb_bricks::{MeshOptions, Model};
 
 /// A unit square in the plane y = 0 that faces up (-y), seen counter-clockwise.

@@ -1,5 +1,7 @@
 //! The built-in model.
 
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
 use mb_bricks::{MeshOptions, Model, demo_model};
 
 #[test]

@@ -1,5 +1,7 @@
 //! Damaged and malicious files: a clear refusal or a bounded warning, never a panic.
 
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};

@@ -1,5 +1,7 @@
 //! Published models against reference numbers that an independent flattener made.
 
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
 use std::collections::BTreeMap;
 
 use mb_bricks::{MeshOptions, Model, ModelInfo, PartLibrary};

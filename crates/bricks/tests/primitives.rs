@@ -1,14 +1,16 @@
 //! The 72 primitive bricks of Wang et al. (2022), drawn by ourselves, against the official geometry.
 
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
 use mb_bricks::{MeshOptions, Model, PartLibrary};
 use mb_geometry::Ray;
 use mb_mesh::{Bvh, TriangleMesh, sample_uniform};
 use nalgebra::{Point3, Vector3};
 
-/// Directions from which a brick is looked at: from all sides and above.
+/// Directions from which a brick is looked at: from all around, above and below.
 fn views() -> Vec<Vector3<f64>> {
-    let mut views = vec![Vector3::y()];
-    for (rise, count) in [(0.03, 8), (0.5, 8), (1.3, 4)] {
+    let mut views = vec![Vector3::y(), -Vector3::y()];
+    for (rise, count) in [(0.03, 8), (0.5, 8), (1.3, 4), (-0.5, 8), (-1.3, 8), (-4.0, 4)] {
         for index in 0..count {
             let angle = 0.3 + std::f64::consts::TAU * f64::from(index) / f64::from(count);
             views.push(Vector3::new(angle.cos(), rise, angle.sin()).normalize());

@@ -205,7 +205,7 @@ impl<'a> Gathering<'a> {
         for reference in &file.references {
             let linear = &reference.parent_from_child.linear;
             let volume: f64 = linear.row_iter().map(|row| row.norm()).product();
-            if !(linear.determinant().abs() > 1e-9 * volume) {
+            if linear.determinant().abs() <= 1e-9 * volume {
                 let found = format!("the matrix of `{}` is singular: it flattens the part", reference.name);
                 return Err(InputError::new(&file.source, found)
                     .at_line(reference.line as usize)

@@ -131,11 +131,11 @@ impl Reader<'_> {
     fn line(&mut self, line: &str, number: u32, start: usize, end: usize) -> Result<()> {
         let mut tokens = Tokens(line);
         let Some(kind) = tokens.next() else { return Ok(()) };
-        if kind == "0" {
-            if let Some(name) = file_line(tokens.0) {
-                self.begin_file(name, number, start, end);
-                return Ok(());
-            }
+        if kind == "0"
+            && let Some(name) = file_line(tokens.0)
+        {
+            self.begin_file(name, number, start, end);
+            return Ok(());
         }
         if self.open().closed {
             return Ok(());
@@ -425,7 +425,7 @@ impl<'a> Tokens<'a> {
         for number in &mut numbers {
             let word = self.next().ok_or(Malformed::Line("it ends too early"))?;
             *number = word.parse().map_err(|_| Malformed::Line("one of its numbers is none"))?;
-            if !(number.abs() <= MAX_COORDINATE) {
+            if number.is_nan() || number.abs() > MAX_COORDINATE {
                 return Err(Malformed::Number(word.to_owned()));
             }
         }

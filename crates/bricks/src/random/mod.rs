@@ -29,7 +29,7 @@ const ATTEMPTS: u64 = 60;
 const MAX_LOAD: f64 = 0.8;
 
 /// What to grow.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RandomOptions {
     /// Bricks of each model, 2 to 2000; 0 draws a number between 25 and 150 for each.
@@ -38,12 +38,6 @@ pub struct RandomOptions {
     pub seed: u64,
     /// Distributions and limits.
     pub profile: RandomProfile,
-}
-
-impl Default for RandomOptions {
-    fn default() -> Self {
-        Self { bricks: 0, seed: 0, profile: RandomProfile::default() }
-    }
 }
 
 /// What a random model is like.
