@@ -163,19 +163,23 @@ struct Bounds {
 
 impl Bounds {
     /// First and last column, first and last row; `None` where no pixel centre lies inside.
+    #[inline]
     fn pixels(&self, size: ImageSize) -> Option<[(u16, u16); 2]> {
         // Far more than the rounding of a projection, far less than a pixel.
         const SLACK_PX: f64 = 1e-6;
         let range = |axis: usize, pixels: usize| {
             // Rounds up and down by truncation, which is one instruction everywhere.
-            let first = (self.low[axis] + (1.0 - SLACK_PX)).max(0.0) as u32;
-            let last = (self.high[axis] + SLACK_PX).min(pixels as f64 - 1.0);
+            let (first, last) = (self.low[axis] + (1.0 - SLACK_PX), self.high[axis] + SLACK_PX);
+            let first = if first > 0.0 { first as u32 } else { 0 };
+            let end = pixels as f64 - 1.0;
+            let last = if last < end { last } else { end };
             (last >= f64::from(first)).then_some((first as u16, last as u16))
         };
         Some([range(0, size.width)?, range(1, size.height)?])
     }
 }
 
+#[inline]
 fn bounds_in_front([a, b, c]: [&Corner; 3]) -> Bounds {
     // Plain comparisons: these compile to single instructions, `f64::min` does not.
     let min = |a: f64, b: f64| if a < b { a } else { b };
