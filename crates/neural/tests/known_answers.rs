@@ -11,6 +11,7 @@ use mb_neural::nerf::{Nerf, NerfOptions};
 use mb_neural::neus::{Neus, NeusOptions};
 use mb_neural::sdf_field::PositionEncoding;
 use mb_neural::trainer::{RunOptions, train};
+use mb_neural::{FieldOptions, Method, reconstruct, synthesize};
 use nalgebra::{Matrix3, Point2, Point3, Rotation3, UnitQuaternion, Vector3};
 
 const CENTER: Vector3<f64> = Vector3::new(0.4, -0.2, 1.0);
@@ -214,6 +215,38 @@ fn a_stopped_and_resumed_run_ends_with_the_same_bytes_for_any_thread_count() {
         let run = RunOptions { checkpoint: Some(path.clone()), ..RunOptions::default() };
         assert!(matches!(train(&mut Nerf::new(small_nerf()), &data, &json, &run, &Silent), Err(Error::Input(_))));
     }
+}
+
+#[test]
+fn a_sequence_on_disk_becomes_a_mesh_and_pictures() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let root = dir.path().join("ball");
+    for (i, (rgb, mask, intrinsics, pose)) in photographs(9, ball(0.06)).into_iter().enumerate() {
+        mb_image::write_rgb_png(root.join(format!("image/{i:06}.png")), &rgb).expect("written");
+        let mask = mask.expect("photographs have masks").map(|m| *m >= 128);
+        mb_image::write_mask_png(root.join(format!("mask/{i:06}.png")), &mask).expect("written");
+        mb_capture::write_pose_txt(root.join(format!("pose/{i:06}.txt")), &pose).expect("written");
+        mb_capture::write_intrinsics_txt(root.join(format!("intrinsic/{i:06}.txt")), &intrinsics).expect("written");
+    }
+    let sequence = mb_capture::Sequence::open(&root).expect("a sequence");
+    let mut options = FieldOptions::preset("neus", "fast", 0).expect("a known method");
+    options.method = Method::Neus(small_neus().with_iterations(60));
+    options.data.max_side_px = 64;
+    options.surface.voxel_mm = 4.0;
+    let (mesh, summary) = reconstruct(&sequence, &options, &Silent).expect("a mesh");
+    assert_eq!((summary.images, summary.training.steps), (9, 60));
+    let bounds = mesh.bounds();
+    assert!((bounds.center().coords - CENTER).norm() < 0.03, "the mesh is not in the world frame: {bounds:?}");
+    assert_eq!(mesh.vertex_colors.map(|c| c.len()), Some(mesh.vertices.len()));
+
+    options.method = Method::Nerf(small_nerf());
+    let out = dir.path().join("views");
+    let summary = synthesize(&sequence, &options, &out, &Silent).expect("pictures");
+    assert_eq!(summary.per_image.iter().map(|v| v.frame.0).collect::<Vec<_>>(), [0, 8]);
+    for name in ["000000.png", "000008.png", "reference/000000.png", "reference/000008.png"] {
+        assert_eq!(mb_image::read_size(out.join(name)).expect("a picture"), ImageSize::new(64, 64));
+    }
+    assert!(FieldOptions::preset("nerf", "slow", 0).is_none());
 }
 
 #[test]
