@@ -267,3 +267,69 @@ fn damped(hessian: &DMatrix<f64>, damping: f64) -> DMatrix<f64> {
     }
     damped
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::contour::motion_about;
+    use nalgebra::UnitQuaternion;
+    use rand::RngExt;
+
+    /// Cameras on a circle, points in a box and on the plane y = 0, seen without noise, with wrong drifts and points.
+    #[test]
+    fn exact_pixels_give_back_the_cameras_in_the_frame_that_the_surface_fixes() {
+        let mut rng = mb_job::rng(4, 0);
+        let mut uniform = |size: f64| rng.random_range(-size..size);
+        let center = Vector3::new(0.01, 0.0, -0.02);
+        let intrinsics = Intrinsics { fx: 700.0, fy: 702.0, cx: 480.0, cy: 360.0 };
+        let mut truths = Vec::new();
+        let mut cameras: Vec<AdjustedCamera> = Vec::new();
+        for i in 0..6 {
+            let angle = f64::from(i) * 0.3;
+            let eye = Vector3::new(0.3 * angle.cos(), 0.25, 0.3 * angle.sin());
+            let pose = Rigid3::<World, Camera>::from_parts(UnitQuaternion::face_towards(&-eye, &-Vector3::y()), eye);
+            let drift = motion_about(&Vector6::from_fn(|k, _| uniform(if k < 3 { 0.008 } else { 0.003 })), &center);
+            truths.push(drift);
+            cameras.push(AdjustedCamera { intrinsics, cam_from_world: pose.inverse(), drift });
+        }
+        let mut adjustment = Adjustment {
+            cameras,
+            points: Vec::new(),
+            center,
+            feature_px: 0.5,
+            surface_m: 1e-4,
+            drift_information: Matrix6::identity() * 1e-6,
+            step_information: Matrix6::zeros(),
+        };
+        for i in 0..120 {
+            let on_plane = i % 2 == 0;
+            let p = Point3::new(uniform(0.06), if on_plane { 0.0 } else { uniform(0.05) }, uniform(0.06));
+            // Three planes across each other fix the frame.
+            let surface = match i % 6 {
+                0 | 2 | 4 => Some((Point3::origin(), Vector3::y())),
+                1 => Some((p, Vector3::x())),
+                3 => Some((p, Vector3::z())),
+                _ => None,
+            };
+            let mut point = AdjustedPoint { in_world: p, surface, observations: Vec::new() };
+            for camera_idx in 0..6 {
+                let zero = PointObservation { camera_idx, pixel: Point2::origin(), is_inlier: true };
+                let minus_predicted = adjustment.residual(&point, &zero).expect("the point lies before the camera");
+                point.observations.push(PointObservation { pixel: Point2::from(-minus_predicted), ..zero });
+            }
+            adjustment.points.push(point);
+        }
+        for camera in &mut adjustment.cameras {
+            camera.drift = Rigid3::identity();
+        }
+        for point in &mut adjustment.points {
+            point.in_world += Vector3::new(uniform(0.002), uniform(0.002), uniform(0.002));
+        }
+        let covariances = adjustment.solve(&[], 60).expect("the system has a solution");
+        for ((camera, truth), covariance) in adjustment.cameras.iter().zip(&truths).zip(&covariances) {
+            let error = twist_about(&(camera.drift.inverse() * *truth), &center);
+            assert!(error.norm() < 1e-5, "{error:?}");
+            assert!(covariance.symmetric_eigenvalues().min() > 0.0);
+        }
+    }
+}
