@@ -47,7 +47,7 @@ pub fn run<T: Send>(py: Python<'_>, job: impl FnOnce(&dyn Progress) -> mb_job::R
         let worker = scope.spawn(move || {
             let outcome = job(&Stop(stop));
             // The listener waits until the sender is dropped, so a panic wakes it too.
-            drop(done.send(()));
+            let _ = done.send(());
             outcome
         });
         let mut finished = finished;
