@@ -127,6 +127,11 @@ pub(crate) fn tile(footprint: Footprint, groove: bool) -> Columns {
     if groove {
         solid.fill(footprint.outline(1.0), [PLATE - groove_height - OVERLAP, PLATE]);
     }
-    hollow(&mut solid, footprint, PLATE);
+    if groove && footprint.length * footprint.width == 2 {
+        // The official 1 x 2 tile has no pin.
+        solid.empty(footprint.outline(WALL), [WALL, PLATE + OVERLAP]);
+    } else {
+        hollow(&mut solid, footprint, PLATE);
+    }
     solid
 }
