@@ -16,7 +16,7 @@ use crate::contraction::contract;
 use crate::dataset::{RayDataset, SceneRay, TargetRay};
 use crate::hash_grid::HashGridOptions;
 use crate::model::{GROUPS, Level, Model, StepReport, TILE};
-use crate::occupancy::{OccupancyGrid, TURNS};
+use crate::occupancy::{CELL_MEMORY, OccupancyGrid, TURNS};
 use crate::radiance_field::{RadianceField, RadianceFieldOptions, RadianceParameters, RadianceWorker, Transposed};
 
 /// How a fast NeRF is trained. Lengths are in radii of the region of interest.
@@ -281,7 +281,7 @@ impl Nerf {
     fn refresh_occupancy(&mut self, turn: u64) {
         let all = turn < TURNS && (turn + 1).is_power_of_two();
         let (field, parameters) = (&self.field, &self.parameters);
-        self.occupancy.update(self.options.seed ^ 0x6f63, turn, all, 0.95, |positions, out| {
+        self.occupancy.update(self.options.seed ^ 0x6f63, turn, all, CELL_MEMORY, |positions, out| {
             let mut worker = RadianceWorker::default();
             for tile in positions.chunks(TILE) {
                 field.density(parameters, tile, &mut worker);

@@ -23,7 +23,7 @@ use crate::dataset::{RayDataset, SceneRay, TargetRay};
 use crate::hash_grid::HashGridOptions;
 use crate::model::{GROUPS, Level, Model, StepReport, TILE};
 use crate::neus_alpha::Section;
-use crate::occupancy::{OccupancyGrid, TURNS};
+use crate::occupancy::{CELL_MEMORY, OccupancyGrid, TURNS};
 use crate::radiance_field::{RadianceField, RadianceFieldOptions, RadianceParameters, RadianceWorker, Transposed};
 use crate::sdf_field::{DirectionEncoding, PositionEncoding, SdfField, SdfFieldOptions, SdfWorker};
 
@@ -498,7 +498,7 @@ impl Neus {
         });
         if !self.with_masks {
             let (outside, parameters) = (&self.outside, &self.outside_parameters);
-            self.outer_cells.update(self.options.seed ^ 0x6f75, turn, all, 0.95, |units, out| {
+            self.outer_cells.update(self.options.seed ^ 0x6f75, turn, all, CELL_MEMORY, |units, out| {
                 let mut worker = RadianceWorker::default();
                 for tile in units.chunks(TILE) {
                     outside.density(parameters, tile, &mut worker);

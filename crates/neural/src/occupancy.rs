@@ -18,6 +18,9 @@ pub struct OccupancyGrid {
 
 /// A cell is refreshed in every sixteenth update.
 pub const TURNS: u64 = 16;
+/// What the running maximum of a density keeps at each refresh. instant-ngp has 0.95, but looks at a cell every 16 to 64
+/// steps; here 256 steps lie between two looks, and a haze that has gone must not be marched through for thousands.
+pub const CELL_MEMORY: f32 = 0.4;
 /// Positions that the field is asked for at once.
 const PIECE: usize = 4096;
 
