@@ -17,19 +17,6 @@ fn main() {
     let castle = timed("built-in castle: draw its bricks", demo_model);
     timed("built-in castle: mesh", || castle.mesh(&MeshOptions::default()));
     timed("built-in castle: check", || castle.check(&CheckOptions::default())).expect("the castle is complete");
-    let mesh = castle.mesh(&MeshOptions::default());
-    let (_, outside) = timed("built-in castle: outside only", || external_only(&mesh));
-    println!("built-in castle: {} of {} triangles are outside", outside.kept, outside.triangles);
-    let batch = timed("135 random models", || random_models(&RandomOptions::default(), 135, &Silent));
-    if let Ok(batch) = batch {
-        let parts: Vec<usize> = batch.iter().map(|random| random.summary.parts).collect();
-        println!("random models: {} to {} parts", parts.iter().min().unwrap_or(&0), parts.iter().max().unwrap_or(&0));
-        let options = RandomOptions { bricks: 150, ..RandomOptions::default() };
-        if let Ok(large) = mb_bricks::random_model(&options, 0) {
-            timed("random model of 150 bricks: check", || large.model.check(&CheckOptions::default()))
-                .expect("random models are complete");
-        }
-    }
     let Some(library) = mb_testdata::find("ldraw/parts.zip") else { return };
     for name in ["10214-1-tower-bridge", "10182-1-cafe-corner"] {
         let Some(path) = mb_testdata::find(&format!("ldraw/models/{name}.mpd")) else { return };
@@ -51,6 +38,19 @@ fn main() {
                 report.collisions.len(),
                 report.stable
             );
+        }
+    }
+    let mesh = castle.mesh(&MeshOptions::default());
+    let (_, outside) = timed("built-in castle: outside only", || external_only(&mesh));
+    println!("built-in castle: {} of {} triangles are outside", outside.kept, outside.triangles);
+    let batch = timed("135 random models", || random_models(&RandomOptions::default(), 135, &Silent));
+    if let Ok(batch) = batch {
+        let parts: Vec<usize> = batch.iter().map(|random| random.summary.parts).collect();
+        println!("random models: {} to {} parts", parts.iter().min().unwrap_or(&0), parts.iter().max().unwrap_or(&0));
+        let options = RandomOptions { bricks: 150, ..RandomOptions::default() };
+        if let Ok(large) = mb_bricks::random_model(&options, 0) {
+            timed("random model of 150 bricks: check", || large.model.check(&CheckOptions::default()))
+                .expect("random models are complete");
         }
     }
 }
