@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use mb_align::{KeypointOptions, align_keypoints};
+use mb_align::{BundleOptions, KeypointOptions, RefineOptions, align_bundle, align_keypoints, align_refine};
 use mb_bricks::Model;
 use mb_capture::Sequence;
-use mb_eval::{SurfaceOptions, SurfaceProtocol, SurfaceScores, evaluate_poses, evaluate_surface};
+use mb_eval::{PosesScores, SurfaceOptions, SurfaceProtocol, SurfaceScores, evaluate_poses, evaluate_surface};
 use mb_geometry::ImageSize;
 use mb_job::{Error, Progress, Result};
 use mb_recon::{TsdfOptions, reconstruct_tsdf};
@@ -45,6 +45,8 @@ pub struct DemoSummary {
     pub mesh: PathBuf,
     /// The report page.
     pub report: PathBuf,
+    /// Errors of the aligned cameras against the simulator's truth.
+    pub poses: PosesScores,
     /// Scores of the reconstruction, one entry per protocol.
     pub scores: Vec<SurfaceScores>,
     /// Wall time.
@@ -53,7 +55,7 @@ pub struct DemoSummary {
     pub warnings: Vec<String>,
 }
 
-/// Runs every stage on `model` in the folder `out`, and ends with `out/report.html`.
+/// Runs every stage on `model` in the folder `out`, and ends with `out/report.html` and its digest, `out/overview.jpg`.
 ///
 /// A run that was stopped is taken up again: the capture keeps its finished frames, later stages are short.
 ///
@@ -79,7 +81,13 @@ pub fn demo(model: &Model, options: &DemoOptions, out: &Path, progress: &dyn Pro
 
     let keypoints = KeypointOptions::default();
     log.run("align keypoints", &keypoints, || align_keypoints(&sequence, &keypoints, progress))?;
-    log.run("eval poses", &(), || evaluate_poses(&folder.join("simulation"), &folder))?;
+    let refine = RefineOptions { seed: options.seed, ..RefineOptions::default() };
+    log.run("align refine", &refine, || align_refine(&sequence, &refine, progress))?;
+    let bundle = BundleOptions { seed: options.seed, ..BundleOptions::default() };
+    log.run("align bundle", &bundle, || align_bundle(&sequence, &bundle, progress))?;
+    let poses = log.run("eval poses", &(), || evaluate_poses(&folder.join("simulation"), &folder))?;
+    // The bundle wrote new poses.
+    let sequence = Sequence::open(&folder)?;
 
     let truth_options = TruthOptions::default();
     log.run("truth", &truth_options, || truth(&sequence, &truth_options, progress))?;
@@ -105,11 +113,15 @@ pub fn demo(model: &Model, options: &DemoOptions, out: &Path, progress: &dyn Pro
     report.stages = log.stages;
     report.warnings.extend(log.warnings.iter().cloned());
     report.write(&report_path)?;
+    if let Some(overview) = report.overview() {
+        mb_image::write_jpeg(out.join("overview.jpg"), &overview, 90)?;
+    }
 
     Ok(DemoSummary {
         sequence: folder,
         mesh: mesh_path,
         report: report_path,
+        poses,
         scores,
         seconds: start.elapsed().as_secs_f64(),
         warnings: log.warnings,

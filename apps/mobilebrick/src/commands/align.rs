@@ -1,9 +1,10 @@
 //! `align`: where the object and the cameras are.
 
 use clap::{Args, Subcommand};
+use mb_align::{BundleOptions, RefineOptions};
 use mb_job::Result;
 
-use super::SequenceArgument;
+use super::{Seed, SequenceArgument};
 use crate::outcome::Outcome;
 use crate::terminal::Terminal;
 
@@ -12,6 +13,10 @@ use crate::terminal::Terminal;
 pub enum Align {
     /// The object's pose from clicked points (annotation/keypoints.json)
     Keypoints(Keypoints),
+    /// The object's pose from the model's edges in the photographs; starts from an alignment
+    Refine(Refine),
+    /// Every camera, with the model as the map; starts from an alignment
+    Bundle(Bundle),
 }
 
 impl Align {
@@ -19,6 +24,8 @@ impl Align {
     pub fn run(self, terminal: &Terminal) -> Result<Outcome> {
         match self {
             Self::Keypoints(c) => c.run(terminal),
+            Self::Refine(c) => c.run(terminal),
+            Self::Bundle(c) => c.run(terminal),
         }
     }
 }
@@ -43,6 +50,83 @@ impl Keypoints {
             summary.translation_std_mm,
             summary.rotation_std_deg,
             summary.written.display()
+        );
+        Outcome::new(&summary, text)
+    }
+}
+
+/// The object's pose from the model's edges in the photographs; starts from an alignment
+#[derive(Debug, Args)]
+pub struct Refine {
+    #[command(flatten)]
+    sequence: SequenceArgument,
+
+    /// Photographs to use, spread over the sequence
+    #[arg(long, value_name = "N", default_value_t = RefineOptions::default().frames)]
+    frames: usize,
+
+    #[command(flatten)]
+    seed: Seed,
+}
+
+impl Refine {
+    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
+        let options = RefineOptions { frames: self.frames, seed: self.seed.seed, ..RefineOptions::default() };
+        let summary = mb_align::align_refine(&self.sequence.open()?, &options, terminal)?;
+        let text = format!(
+            "moved {:.2} mm and {:.3} deg; {:.0} % of the visible edges found, {:.2} px rms; confidence {:.2}, \
+             expected error {:.2} mm and {:.3} deg",
+            summary.moved_mm,
+            summary.turned_deg,
+            summary.agreement * 100.0,
+            summary.rms_px,
+            summary.confidence,
+            summary.expected_error_mm,
+            summary.expected_error_deg
+        );
+        Outcome::new(&summary, text)
+    }
+}
+
+/// Every camera, with the model as the map; starts from an alignment
+#[derive(Debug, Args)]
+pub struct Bundle {
+    #[command(flatten)]
+    sequence: SequenceArgument,
+
+    /// Leave out features beside the model, as the paper does
+    #[arg(long)]
+    no_free_points: bool,
+
+    /// Leave out the model's edges, as the paper does
+    #[arg(long)]
+    no_contours: bool,
+
+    /// Leave out the phone's poses as priors from frame to frame
+    #[arg(long)]
+    no_relative_poses: bool,
+
+    #[command(flatten)]
+    seed: Seed,
+}
+
+impl Bundle {
+    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
+        let options = BundleOptions {
+            free_points: !self.no_free_points,
+            contours: !self.no_contours,
+            relative_poses: !self.no_relative_poses,
+            seed: self.seed.seed,
+            ..BundleOptions::default()
+        };
+        let summary = mb_align::align_bundle(&self.sequence.open()?, &options, terminal)?;
+        let text = format!(
+            "{} cameras from {} points on the model and {} beside it, {:.2} px rms; cameras moved {:.2} mm rms",
+            summary.frames.len(),
+            summary.surface_points,
+            summary.free_points,
+            summary.rms_px,
+            summary.moved_rms_mm
         );
         Outcome::new(&summary, text)
     }

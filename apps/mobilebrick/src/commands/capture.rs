@@ -3,28 +3,38 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
+use mb_capture::{CaptureFormat, ExportFormat, ImportOptions};
 use mb_geometry::ImageSize;
 use mb_job::Result;
 use mb_pipeline::{ModelCapture, simulate_model};
 use mb_simulate::{Quality, SimulateOptions};
 
-use super::Seed;
 use super::model::ModelArgument;
+use super::{Seed, SequenceArgument};
 use crate::outcome::Outcome;
 use crate::terminal::Terminal;
 
 /// Sequences: photographs, depth and poses of a phone, or of one in software
 #[derive(Debug, Subcommand)]
 pub enum Capture {
+    /// Read a recording of a phone app or another data set as a sequence; the format is detected
+    Import(Import),
     /// Film a model with a phone in software; the truth is kept beside what the phone says
     Simulate(Simulate),
+    /// Look for what is missing, damaged, inconsistent or in the wrong convention
+    Check(Check),
+    /// Write a sequence in the layout of another program
+    Export(Export),
 }
 
 impl Capture {
     /// Runs the subcommand.
     pub fn run(self, terminal: &Terminal) -> Result<Outcome> {
         match self {
+            Self::Import(c) => c.run(terminal),
             Self::Simulate(c) => c.run(terminal),
+            Self::Check(c) => c.run(terminal),
+            Self::Export(c) => c.run(terminal),
         }
     }
 }
@@ -109,4 +119,145 @@ fn parse_size(text: &str) -> Result<ImageSize, String> {
     let sides = text.split_once(['x', 'X']).and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let (width, height) = sides.ok_or("must look like 1920x1440")?;
     Ok(ImageSize::new(width, height))
+}
+
+/// Formats that can be read.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum ImportFormat {
+    Mobilebrick,
+    ArkitJson,
+    Stray,
+    Record3d,
+    Arkitscenes,
+    Nerfstudio,
+    Colmap,
+    Photos,
+}
+
+impl From<ImportFormat> for CaptureFormat {
+    fn from(format: ImportFormat) -> Self {
+        match format {
+            ImportFormat::Mobilebrick => Self::Mobilebrick,
+            ImportFormat::ArkitJson => Self::ArkitJson,
+            ImportFormat::Stray => Self::Stray,
+            ImportFormat::Record3d => Self::Record3d,
+            ImportFormat::Arkitscenes => Self::Arkitscenes,
+            ImportFormat::Nerfstudio => Self::Nerfstudio,
+            ImportFormat::Colmap => Self::Colmap,
+            ImportFormat::Photos => Self::Photos,
+        }
+    }
+}
+
+/// Read a recording of a phone app or another data set as a sequence; the format is detected
+#[derive(Debug, Args)]
+pub struct Import {
+    /// Folder or archive to read
+    #[arg(value_name = "SRC")]
+    source: PathBuf,
+
+    /// Its format, where detection is not wanted
+    #[arg(long = "as", value_enum, value_name = "FORMAT")]
+    format: Option<ImportFormat>,
+
+    /// Sequence folder to write, new or empty
+    #[arg(short, long, value_name = "SEQ")]
+    out: PathBuf,
+
+    /// Take every N-th frame
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    every: usize,
+
+    /// First and last frame number to take
+    #[arg(long, value_name = "FIRST-LAST", value_parser = parse_range)]
+    range: Option<(u32, u32)>,
+}
+
+impl Import {
+    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
+        let options = ImportOptions { range: self.range, every: self.every };
+        let summary = mb_capture::import(&self.source, self.format.map(Into::into), &self.out, &options, terminal)?;
+        let mut text = format!(
+            "read {}: {} of {} frames, {} with depth, {} with a pose; wrote {}\n",
+            summary.format.name(),
+            summary.frames_imported,
+            summary.frames_found,
+            summary.frames_with_depth,
+            summary.frames_with_pose,
+            self.out.display()
+        );
+        for skipped in &summary.frames_skipped {
+            text += &format!("left out {}: {}\n", skipped.frame, skipped.reason);
+        }
+        Outcome::new(&summary, text)
+    }
+}
+
+/// Look for what is missing, damaged, inconsistent or in the wrong convention
+#[derive(Debug, Args)]
+pub struct Check {
+    #[command(flatten)]
+    sequence: SequenceArgument,
+}
+
+impl Check {
+    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
+        let summary = mb_capture::check(&self.sequence.open()?, &Default::default(), terminal)?;
+        let mut text = format!(
+            "{} frames, {} photographs, {} depth maps, {:.0} % of the way round: {}\n",
+            summary.frames,
+            summary.frames_with_photo,
+            summary.frames_with_depth,
+            summary.orbit_coverage * 100.0,
+            if summary.ok { "nothing wrong".to_owned() } else { format!("{} problems", summary.problems.len()) }
+        );
+        for problem in &summary.problems {
+            let place = problem.frame.map(|frame| format!("frame {frame}: ")).unwrap_or_default();
+            text += &format!("{}: {place}{}\n", problem.kind, problem.message);
+        }
+        Outcome::new(&summary, text)
+    }
+}
+
+/// Layouts that can be written.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum ExportLayout {
+    Colmap,
+    Nerfstudio,
+    Neus,
+    Mvsnet,
+}
+
+/// Write a sequence in the layout of another program
+#[derive(Debug, Args)]
+pub struct Export {
+    #[command(flatten)]
+    sequence: SequenceArgument,
+
+    /// The layout
+    #[arg(long = "as", value_enum, value_name = "LAYOUT")]
+    layout: ExportLayout,
+
+    /// Folder to write, new or empty
+    #[arg(short, long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+impl Export {
+    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
+        let format = match self.layout {
+            ExportLayout::Colmap => ExportFormat::Colmap,
+            ExportLayout::Nerfstudio => ExportFormat::Nerfstudio,
+            ExportLayout::Neus => ExportFormat::Neus,
+            ExportLayout::Mvsnet => ExportFormat::Mvsnet,
+        };
+        let summary = mb_capture::export(&self.sequence.open()?, format, &self.out, terminal)?;
+        let text = format!("wrote {}: {} frames, {} masks", self.out.display(), summary.frames, summary.masks);
+        Outcome::new(&summary, text)
+    }
+}
+
+fn parse_range(text: &str) -> Result<(u32, u32), String> {
+    let ends = text.split_once('-').and_then(|(a, b)| Some((a.parse().ok()?, b.parse().ok()?)));
+    ends.filter(|(first, last)| first <= last).ok_or_else(|| "must look like 10-99".to_owned())
 }

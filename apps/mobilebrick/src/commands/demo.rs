@@ -43,6 +43,12 @@ impl Demo {
         let options = DemoOptions { frames: self.frames, seed: self.seed.seed, ..DemoOptions::default() };
         let summary = demo(&model, &options, &self.out, terminal)?;
         let mut text = format!("done in {:.0} s\n", summary.seconds);
+        if let Some(object) = &summary.poses.object {
+            text += &format!(
+                "cameras in the object's frame: {:.2} mm rms, {:.3} deg mean\n",
+                object.translation_rmse_mm, object.rotation_mean_deg
+            );
+        }
         for scores in &summary.scores {
             text += &format!("TSDF-Fusion, {}: Chamfer {:.2} mm", scores.protocol, scores.chamfer.chamfer_mm);
             for t in &scores.thresholds {

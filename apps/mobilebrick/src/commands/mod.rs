@@ -8,6 +8,7 @@ mod eval;
 mod model;
 mod parts;
 mod reconstruct;
+mod synthesize;
 mod truth;
 
 use std::path::PathBuf;
@@ -38,6 +39,9 @@ pub enum Command {
     /// Reconstruct a sequence's surface with one of the methods
     #[command(subcommand)]
     Reconstruct(reconstruct::Reconstruct),
+    /// Render a sequence's held-out views with one of the methods
+    #[command(subcommand)]
+    Synthesize(synthesize::Synthesize),
     /// Score surfaces, views, depth maps and poses
     #[command(subcommand)]
     Eval(eval::Eval),
@@ -53,6 +57,7 @@ impl Command {
             Self::Align(c) => c.run(terminal),
             Self::Truth(c) => c.run(terminal),
             Self::Reconstruct(c) => c.run(terminal),
+            Self::Synthesize(c) => c.run(terminal),
             Self::Eval(c) => c.run(terminal),
         }
     }

@@ -3,10 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
-use mb_bricks::{MeshOptions, Model as BrickModel};
-use mb_job::{Error, Result};
+use mb_bricks::{MeshOptions, Model as BrickModel, RandomOptions, RandomProfile, random_models};
+use mb_job::{Error, InputError, Result};
 use serde_json::json;
 
+use super::Seed;
 use super::parts::{Parts, PartsArgument};
 use crate::outcome::Outcome;
 use crate::terminal::Terminal;
@@ -18,6 +19,10 @@ pub enum Model {
     Info(Info),
     /// Write the model's geometry: PLY, OBJ, GLB or STL
     Mesh(Mesh),
+    /// Make random models that can be built and stand
+    Random(Random),
+    /// Collisions, connections, stability and a build order
+    Check(Check),
     /// The official parts library
     #[command(subcommand)]
     Parts(Parts),
@@ -25,10 +30,12 @@ pub enum Model {
 
 impl Model {
     /// Runs the subcommand.
-    pub fn run(self, _terminal: &Terminal) -> Result<Outcome> {
+    pub fn run(self, terminal: &Terminal) -> Result<Outcome> {
         match self {
             Self::Info(c) => c.run(),
             Self::Mesh(c) => c.run(),
+            Self::Random(c) => c.run(terminal),
+            Self::Check(c) => c.run(),
             Self::Parts(c) => c.run(),
         }
     }
@@ -96,6 +103,10 @@ pub struct Mesh {
     #[arg(long, value_name = "MM", default_value_t = 0.0)]
     clearance: f64,
 
+    /// Leave out what no view from outside can see: inner walls, tubes
+    #[arg(long)]
+    external_only: bool,
+
     /// Output; the ending chooses the format
     #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
@@ -108,13 +119,97 @@ impl Mesh {
         }
         let model = self.model.read()?;
         let mesh = model.mesh(&MeshOptions { clearance_mm: self.clearance });
+        let (mesh, external) = if self.external_only {
+            let (mesh, external) = mb_bricks::external_only(&mesh);
+            (mesh, Some(external))
+        } else {
+            (mesh, None)
+        };
         mb_mesh::write_mesh(&self.out, &mesh)?;
         let (vertices, triangles) = (mesh.vertices.len(), mesh.triangles.len());
         let warnings = model.info().warnings;
         Outcome::new(
             &json!({ "file": self.out, "vertices": vertices, "triangles": triangles, "clearance_mm": self.clearance,
-                     "frame": "object", "unit": "m", "warnings": warnings }),
+                     "external": external, "frame": "object", "unit": "m", "warnings": warnings }),
             format!("wrote {}: {triangles} triangles, metres, y up", self.out.display()),
         )
+    }
+}
+
+/// Make random models that can be built and stand
+#[derive(Debug, Args)]
+pub struct Random {
+    /// Bricks of each model; 0 draws a number between 25 and 150 for each
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    bricks: usize,
+
+    /// How many models
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    count: usize,
+
+    /// TOML file with brick types, colours, shapes and size limits
+    #[arg(long, value_name = "FILE")]
+    profile: Option<PathBuf>,
+
+    /// A file for one model, a folder for more
+    #[arg(short, long, value_name = "FILE.ldr|DIR")]
+    out: PathBuf,
+
+    #[command(flatten)]
+    seed: Seed,
+}
+
+impl Random {
+    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
+        let profile = match &self.profile {
+            Some(path) => {
+                let text = std::fs::read_to_string(path).map_err(|e| InputError::unreadable(path, &e))?;
+                toml::from_str(&text).map_err(|e| InputError::new(path, e.to_string()))?
+            }
+            None => RandomProfile::default(),
+        };
+        let options = RandomOptions { bricks: self.bricks, seed: self.seed.seed, profile };
+        let models = random_models(&options, self.count, terminal)?;
+        let one_file = self.count == 1 && self.out.extension().is_some();
+        let mut text = String::new();
+        for random in &models {
+            let path = if one_file {
+                self.out.clone()
+            } else {
+                self.out.join(format!("random_{:03}.ldr", random.summary.index))
+            };
+            random.model.write_ldraw(&path)?;
+            let [x, y, z] = random.summary.size_mm;
+            text += &format!("{}: {} bricks, {x:.0} x {y:.0} x {z:.0} mm\n", path.display(), random.summary.parts);
+        }
+        let summaries: Vec<_> = models.iter().map(|m| &m.summary).collect();
+        Outcome::new(&json!({ "seed": self.seed.seed, "models": summaries }), text)
+    }
+}
+
+/// Collisions, connections, stability and a build order
+#[derive(Debug, Args)]
+pub struct Check {
+    #[command(flatten)]
+    model: ModelArgument,
+}
+
+impl Check {
+    fn run(&self) -> Result<Outcome> {
+        let report = self.model.read()?.check(&Default::default())?;
+        let yes = |fact: bool, word: &str| if fact { word.to_owned() } else { format!("not {word}") };
+        let mut text = format!(
+            "{} parts ({} with stud data), {}, {}, {}, {} collisions\n",
+            report.parts,
+            report.covered_parts,
+            yes(report.connected, "connected"),
+            yes(report.stable, "stable"),
+            yes(report.buildable, "buildable in order"),
+            report.collisions.len()
+        );
+        for note in &report.notes {
+            text += &format!("{note}\n");
+        }
+        Outcome::new(&report, text)
     }
 }

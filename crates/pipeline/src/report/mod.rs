@@ -1,6 +1,7 @@
 //! The report: one self-contained HTML page, pictures and charts inside.
 
 mod chart;
+mod overview;
 
 use std::io::Cursor;
 use std::path::Path;
@@ -131,7 +132,7 @@ impl Report {
                     @if !self.curves.is_empty() {
                         h2 { "Scores over the threshold" }
                         p { "Share of the surface within a distance, as the distance grows. Dashed lines are the thresholds of the tables." }
-                        div.pictures { @for c in &self.curves { (curves(c)) } }
+                        div.charts { @for c in &self.curves { (curves(c)) } }
                     }
                     @for g in &galleries { (g) }
                     @if !self.stages.is_empty() { (stages(&self.stages)) }
@@ -226,6 +227,10 @@ mod tests {
             curves: vec![Curves { title: "F1".into(), lines: vec![("tsdf".into(), vec![(0.0, 0.0), (10.0, 1.0)])] }],
             ..Report::default()
         };
+        let overview = report.overview().unwrap();
+        assert_eq!(overview.size(), ImageSize::new(420, 420));
+        assert!(overview.data().iter().all(|p| *p == [9, 8, 7]));
+        assert!(Report::default().overview().is_none());
         let page = report.page().unwrap().into_string();
         assert!(page.contains("a &lt;b&gt; &amp; c"));
         assert!(page.contains("data:image/jpeg;base64,"));
