@@ -66,12 +66,14 @@ struct Reduced {
     cost: f64,
 }
 
+/// Camera, its own block and right side, and the block that couples it with the point.
+type CameraBlocks = (usize, Matrix6<f64>, Vector6<f64>, Matrix6x3<f64>);
+
 /// What a point contributes, before elimination.
 struct PointBlocks {
     own: Matrix3<f64>,
     right: Vector3<f64>,
-    /// Camera, its own block and right side, and the block that couples it with the point.
-    cameras: Vec<(usize, Matrix6<f64>, Vector6<f64>, Matrix6x3<f64>)>,
+    cameras: Vec<CameraBlocks>,
     cost: f64,
 }
 

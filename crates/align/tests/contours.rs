@@ -1,5 +1,7 @@
 //! `align refine` and `align bundle` on photographs of coloured boxes, made by the renderer.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on should panic")]
+
 use std::path::Path;
 
 use mb_align::{BundleOptions, RefineOptions, align_bundle, align_refine};

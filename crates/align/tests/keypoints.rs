@@ -1,5 +1,7 @@
 //! `align keypoints` on sequence folders, good and bad.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on should panic")]
+
 use std::path::Path;
 
 use mb_align::{KeypointOptions, KeypointSummary, align_keypoints};

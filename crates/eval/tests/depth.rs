@@ -1,5 +1,7 @@
 //! Scores of depth maps: reference values, laws, and input that is not as it should be.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on should panic")]
+
 use std::path::PathBuf;
 
 use mb_eval::{DepthOptions, DepthScores, MetricDepth, evaluate_depth, score_depth};

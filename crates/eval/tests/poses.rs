@@ -1,5 +1,7 @@
 //! Scores of camera poses: closed forms, laws, the `evo` program's figures, and input that is not as it should be.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on should panic")]
+
 use std::path::{Path, PathBuf};
 
 use mb_capture::{Alignment, AlignmentStage, FrameAlignment, FrameId, write_pose_txt};

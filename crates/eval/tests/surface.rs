@@ -1,5 +1,7 @@
 //! Surface scores against the published script's own numbers, and against closed forms.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on should panic")]
+
 use std::path::Path;
 
 use mb_capture::VisibilityVolume;
@@ -169,7 +171,8 @@ fn large_triangles_are_cut_and_not_dropped() {
 
 #[test]
 fn each_mistake_is_named_with_its_fix() {
-    let cases: [(&str, &str, fn(&mut TriangleMesh)); 7] = [
+    type Mistake = fn(&mut TriangleMesh);
+    let cases: [(&str, &str, Mistake); 7] = [
         ("in millimetres", "by 0.001", |m| m.vertices.iter_mut().for_each(|v| v.coords *= 1000.0)),
         ("other axes", "(x, -y, -z)", |m| {
             m.vertices.iter_mut().for_each(|v| *v = Point3::new(v.x, -v.y, -v.z));

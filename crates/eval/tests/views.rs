@@ -1,5 +1,7 @@
 //! Scores of views: reference values, laws, and input that is not as it should be.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on should panic")]
+
 use std::path::Path;
 
 use mb_eval::{ColorImage, ViewsOptions, evaluate_views, evaluate_views_method, psnr_of_mse, similarity};

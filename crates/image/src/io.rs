@@ -202,7 +202,7 @@ pub fn write_depth_png(path: impl AsRef<Path>, depth: &DepthImage) -> Result<()>
         .iter()
         .flat_map(|&z| {
             let mm = (f64::from(z) * 1e3).round();
-            (if mm >= 1.0 && mm <= 65535.0 { mm as u16 } else { 0 }).to_ne_bytes()
+            (if (1.0..=65535.0).contains(&mm) { mm as u16 } else { 0 }).to_ne_bytes()
         })
         .collect();
     write_png(path.as_ref(), depth.size(), &bytes, ExtendedColorType::L16)

@@ -3,8 +3,6 @@
 //! A [`TriangleMesh`] is plain data in one frame, metres, counter-clockwise triangles seen from outside. Nothing here
 //! assumes that a mesh is closed: brick parts are not.
 
-#![allow(clippy::needless_range_loop, reason = "kernels index several small arrays by axis and child")]
-
 mod bvh;
 mod files;
 mod glb;

@@ -27,7 +27,6 @@
 //!
 //! Limits: pinhole cameras without distortion; one exposure for all photographs; no GPU path yet.
 
-#![allow(clippy::needless_range_loop, reason = "kernels index several small arrays by axis and lane")]
 #![allow(clippy::too_many_arguments, reason = "kernels take buffers with their strides")]
 
 pub mod adam;

@@ -4,6 +4,7 @@
 //! LPIPS and torchvision publish, it is a row of pickles (a magic number, a version, the machine's word sizes, the
 //! weights, the storages' keys), and behind them each storage as its element count and its numbers.
 
+use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap};
 use std::io::Read as _;
 use std::path::Path;
@@ -50,9 +51,9 @@ fn read_zip(path: &Path, bytes: &[u8]) -> Result<BTreeMap<String, Tensor>> {
     let mut storages = HashMap::new();
     for (_, view) in views(path, &pickle)? {
         let (key, _) = storage_of(path, &pickle, view)?;
-        if !storages.contains_key(&key) {
-            let content = member(&format!("{folder}data/{key}"))?;
-            storages.insert(key, content);
+        if let Entry::Vacant(storage) = storages.entry(key) {
+            let content = member(&format!("{folder}data/{}", storage.key()))?;
+            storage.insert(content);
         }
     }
     tensors(path, &pickle, |key| storages.get(key).map(Vec::as_slice))
@@ -134,8 +135,11 @@ fn storage_of(path: &Path, pickle: &Pickle, view: &View) -> Result<(String, Stor
     }
 }
 
+/// Reads one number.
+type Decode = fn(&[u8]) -> f32;
+
 /// Bytes per number, and how to read one.
-fn decoder_of(kind: StorageType) -> Option<(usize, fn(&[u8]) -> f32)> {
+fn decoder_of(kind: StorageType) -> Option<(usize, Decode)> {
     decoder(match kind {
         StorageType::F16 => "F16",
         StorageType::BF16 => "BF16",

@@ -1,5 +1,7 @@
 //! TSDF fusion of shapes whose surface is known in closed form.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on should panic")]
+
 use mb_geometry::{Camera, ImageSize, Intrinsics, Rigid3, World};
 use mb_image::{DepthImage, Image, RgbImage};
 use mb_mesh::TriangleMesh;

@@ -19,8 +19,6 @@
 //! assert_eq!(scene.depth(&view)[(16, 12)], 0.5);
 //! ```
 
-#![allow(clippy::needless_range_loop, reason = "kernels index several small arrays by axis and lane")]
-
 mod overlay;
 mod raster;
 mod ray_cast;

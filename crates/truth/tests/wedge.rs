@@ -1,5 +1,7 @@
 //! Ground truth of a published-layout sequence, made again from its exact mesh and cameras.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on should panic")]
+
 use std::path::Path;
 
 use mb_capture::{Alignment, AlignmentStage, Sequence, VisibilityVolume};
