@@ -4,10 +4,12 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 use mb_eval::{
-    DepthOptions, SurfaceOptions, SurfaceProtocol, ThresholdScore, ViewsOptions, evaluate_depth, evaluate_poses,
-    evaluate_surface, evaluate_surface_method, evaluate_views, read_sequence_list,
+    DepthOptions, PerceptualMetric, SurfaceOptions, SurfaceProtocol, ThresholdScore, ViewsOptions, evaluate_depth,
+    evaluate_poses, evaluate_surface, evaluate_surface_method, evaluate_views, evaluate_views_method,
+    read_sequence_list,
 };
-use mb_job::{Error, Result};
+use mb_job::{Error, Result, write_atomic};
+use mb_perceptual::{Lpips, LpipsNet};
 
 use super::Seed;
 
@@ -25,6 +27,8 @@ pub enum Eval {
     Depth(Depth),
     /// Camera poses: sequences, or folders with pose/*.txt
     Poses(Poses),
+    /// Check LPIPS weights, and convert them to one safetensors file
+    LpipsWeights(LpipsWeights),
 }
 
 impl Eval {
@@ -35,6 +39,7 @@ impl Eval {
             Self::Views(c) => c.run(terminal),
             Self::Depth(c) => c.run(terminal),
             Self::Poses(c) => c.run(),
+            Self::LpipsWeights(c) => c.run(),
         }
     }
 }
@@ -154,10 +159,34 @@ fn score_lines(chamfer_mm: f64, thresholds: &[ThresholdScore]) -> String {
 }
 
 /// Novel views: PSNR, SSIM, LPIPS; images are paired by file name
+///
+/// Two folders: `--gt DIR --pred DIR`. A method over a list of sequences: `--method NAME --list FILE -o DIR`, with the
+/// images at ./nvs/NAME/SEQ/{gt,render}_ID.png as the published scripts have them.
 #[derive(Debug, Args)]
 pub struct Views {
-    #[command(flatten)]
-    folders: Folders,
+    /// Ground truth
+    #[arg(long, value_name = "DIR", requires = "pred", required_unless_present = "method", conflicts_with = "method")]
+    gt: Option<PathBuf>,
+
+    /// Prediction
+    #[arg(long, value_name = "DIR", requires = "gt")]
+    pred: Option<PathBuf>,
+
+    /// Method whose views lie in the folder of that name
+    #[arg(long, value_name = "NAME", requires_all = ["list", "out"])]
+    method: Option<String>,
+
+    /// File with the sequences' names, separated by commas or line ends
+    #[arg(long, value_name = "FILE", requires = "method")]
+    list: Option<PathBuf>,
+
+    /// Folder that holds a folder of views for each method
+    #[arg(long, value_name = "DIR", default_value = "nvs")]
+    nvs: PathBuf,
+
+    /// Folder for data.csv (as published)
+    #[arg(short, long, value_name = "DIR", requires = "method")]
+    out: Option<PathBuf>,
 
     /// Score every N-th image of the ground truth only; the paper holds out every 8th
     #[arg(long, value_name = "N")]
@@ -166,16 +195,67 @@ pub struct Views {
     /// Folder of masks with the images' names; white is scored
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
+
+    /// Network of LPIPS: vgg (as in the paper's tables), alex or squeeze
+    #[arg(long, value_name = "NET", default_value = "vgg")]
+    lpips_net: LpipsNet,
+
+    /// Weights of LPIPS, safetensors or the original .pth; repeat for a backbone and its linear layers
+    #[arg(long, value_name = "FILE")]
+    lpips_weights: Vec<PathBuf>,
 }
 
 impl Views {
-    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
-        let options = ViewsOptions { hold_out: self.hold_out, masks: self.masks.clone() };
-        let scores = evaluate_views(&self.folders.gt, &self.folders.pred, &options, None, terminal)?;
-        let lpips = scores.lpips.map_or_else(|| "no weights given".to_owned(), |v| format!("{v:.4}"));
-        let text =
-            format!("{} images: PSNR {:.2} dB, SSIM {:.4}, LPIPS {lpips}", scores.images, scores.psnr, scores.ssim);
+    fn run(self, terminal: &Terminal) -> Result<Outcome> {
+        let options = ViewsOptions { hold_out: self.hold_out, masks: self.masks };
+        let lpips = match self.lpips_weights.as_slice() {
+            [] => None,
+            files => Some(Lpips::read(self.lpips_net, files)?),
+        };
+        let perceptual = lpips.as_ref().map(|l| l as &dyn PerceptualMetric);
+        let line = |images: usize, psnr: f64, ssim: f64, lpips: Option<f64>| {
+            let lpips = lpips.map_or_else(|| "not computed: give --lpips-weights".to_owned(), |v| format!("{v:.4}"));
+            format!("{images} images: PSNR {psnr:.2} dB, SSIM {ssim:.4}, LPIPS {lpips}")
+        };
+        if let (Some(method), Some(list), Some(out)) = (self.method, self.list, self.out) {
+            let list = read_sequence_list(&list)?;
+            let table = evaluate_views_method(&self.nvs.join(method), &list, &options, perceptual, terminal)?;
+            write_atomic(out.join("data.csv"), table.to_csv(&list).as_bytes())?;
+            return Outcome::new(&table, line(table.images, table.psnr, table.ssim, table.lpips));
+        }
+        let (Some(gt), Some(pred)) = (self.gt, self.pred) else {
+            return Err(Error::Failed("needs --gt and --pred, or --method, --list and --out".into()));
+        };
+        let scores = evaluate_views(&gt, &pred, &options, perceptual, terminal)?;
+        let text = line(scores.images, scores.psnr, scores.ssim, scores.lpips);
         Outcome::new(&scores, text)
+    }
+}
+
+/// Check LPIPS weights, and convert them to one safetensors file
+#[derive(Debug, Args)]
+pub struct LpipsWeights {
+    /// Safetensors or the original .pth: a whole state dictionary, or a backbone and its linear layers
+    #[arg(value_name = "FILE", required = true)]
+    files: Vec<PathBuf>,
+
+    /// Network: vgg, alex or squeeze
+    #[arg(long, value_name = "NET", default_value = "vgg")]
+    net: LpipsNet,
+
+    /// Safetensors file to write
+    #[arg(short, long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+impl LpipsWeights {
+    fn run(&self) -> Result<Outcome> {
+        let lpips = Lpips::read(self.net, &self.files)?;
+        if let Some(out) = &self.out {
+            lpips.write_safetensors(out)?;
+        }
+        let written = self.out.as_ref().map(|out| format!(", wrote {}", out.display())).unwrap_or_default();
+        Outcome::new(lpips.report(), format!("complete weights of LPIPS with {}{written}", self.net.name()))
     }
 }
 

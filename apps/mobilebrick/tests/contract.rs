@@ -1,0 +1,160 @@
+//! What outsiders rely on: exit status, one JSON document on stdout, documented keys, nothing half-written.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on should panic")]
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+fn mobilebrick(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_mobilebrick"))
+        .args(arguments)
+        .env_remove("LDRAWDIR")
+        .env("XDG_DATA_HOME", "/nonexistent")
+        .output()
+        .unwrap()
+}
+
+/// The one JSON document that a successful run prints.
+fn document(arguments: &[&str]) -> Value {
+    let output = mobilebrick(&[arguments, &["--json", "-q"]].concat());
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{arguments:?}: {stderr}");
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+/// The message of a run that must end with `status`.
+fn failure(arguments: &[&str], status: i32) -> String {
+    let output = mobilebrick(arguments);
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(status), "{arguments:?}: {stderr}");
+    stderr
+}
+
+fn has_keys(document: &Value, keys: &[&str]) {
+    for key in keys {
+        assert!(document.get(key).is_some(), "no key {key} in {document:#}");
+    }
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[test]
+fn wrong_usage_is_status_2_and_bad_input_status_3() {
+    failure(&["eval", "surface"], 2);
+    failure(&["model", "info"], 2);
+    failure(&["demo", "--threads", "0"], 2);
+    let dir = tempfile::tempdir().unwrap();
+    let missing = dir.path().join("no.ldr");
+    assert!(failure(&["model", "info", text(&missing)], 3).contains("no.ldr"));
+    assert!(failure(&["truth", text(dir.path())], 3).contains("no frames found"));
+    assert!(failure(&["align", "keypoints", text(&missing)], 3).contains("no such folder"));
+}
+
+#[test]
+fn a_failure_with_json_is_one_document_too() {
+    let output = mobilebrick(&["model", "info", "/nonexistent/model.ldr", "--json"]);
+    assert_eq!(output.status.code(), Some(3));
+    let document: Value = serde_json::from_slice(&output.stdout).unwrap();
+    has_keys(&document, &["error", "exit_status", "file", "found"]);
+}
+
+#[test]
+fn a_failed_mesh_leaves_nothing_behind() {
+    let dir = tempfile::tempdir().unwrap();
+    let model = dir.path().join("broken.ldr");
+    std::fs::write(&model, "1 4 0 0 0 1 0 0 0 nan 0 0 0 1 3001.dat\n").unwrap();
+    let out = dir.path().join("mesh.ply");
+    failure(&["model", "mesh", text(&model), "-o", text(&out)], 3);
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "only the model is there");
+}
+
+#[test]
+fn the_stages_run_by_hand_on_the_built_in_model() {
+    let dir = tempfile::tempdir().unwrap();
+    let sequence = dir.path().join("seq");
+    let seq = text(&sequence);
+
+    let info = document(&["model", "info", "demo"]);
+    has_keys(&info, &["parts", "distinct_parts", "triangles", "steps", "mirrored_parts", "bbox_ldu", "bbox_mm"]);
+    has_keys(&info, &["missing", "bom", "warnings"]);
+    let check = document(&["model", "check", "demo"]);
+    has_keys(&check, &["parts", "covered_parts", "connected", "stable", "collisions", "weakest", "build_order"]);
+    assert_eq!(check["stable"], true);
+
+    let simulated =
+        ["capture", "simulate", "demo", "-o", seq, "--frames", "10", "--size", "480x360", "--quality", "draft"];
+    document(&simulated);
+    let keypoints = document(&["align", "keypoints", seq]);
+    has_keys(&keypoints, &["world_from_object", "rms_px", "residuals", "covariance", "warnings"]);
+    let truth = document(&["truth", seq]);
+    assert_eq!(truth["frames"], 10);
+    let mesh = dir.path().join("tsdf.ply");
+    document(&["reconstruct", "tsdf", seq, "-o", text(&mesh)]);
+
+    for protocol in ["mobilebrick-2023", "exact-1"] {
+        let arguments =
+            ["eval", "surface", "--gt", seq, "--pred", text(&mesh), "--protocol", protocol, "--points", "5000"];
+        let scores = document(&arguments);
+        has_keys(&scores, &["protocol", "sequence", "icp", "chamfer_mm", "pred_to_gt_mm", "gt_to_pred_mm"]);
+        has_keys(&scores, &["thresholds", "seed", "seconds"]);
+        has_keys(&scores["icp"], &["fitness", "applied"]);
+        let thresholds = scores["thresholds"].as_array().unwrap();
+        assert_eq!([&thresholds[0]["threshold_mm"], &thresholds[1]["threshold_mm"]], [2.5, 5.0]);
+        has_keys(&thresholds[0], &["accuracy", "recall", "f1"]);
+    }
+    // The truth as a submission is perfect.
+    let exact = sequence.join("mesh/visible_surface.ply");
+    let perfect = document(&["eval", "surface", "--gt", seq, "--pred", text(&exact), "--protocol", "exact-1"]);
+    assert_eq!(perfect["chamfer_mm"], 0.0);
+    assert_eq!(perfect["thresholds"][0]["f1"], 1.0);
+
+    let simulation = sequence.join("simulation");
+    let poses = document(&["eval", "poses", "--gt", text(&simulation), "--pred", seq]);
+    has_keys(&poses, &["frames", "pairwise", "object", "ate_rmse_mm"]);
+    has_keys(&poses["pairwise"], &["translation_rmse_mm", "rotation_mean_deg"]);
+    has_keys(&poses["object"], &["translation_rmse_mm", "rotation_mean_deg"]);
+    let gt_depth = sequence.join("gt_depth");
+    let depth = document(&["eval", "depth", "--gt", text(&gt_depth), "--pred", text(&gt_depth)]);
+    has_keys(&depth, &["abs_rel", "sq_rel", "rmse_m", "rmse_log", "delta1", "delta2", "delta3", "valid_pixels"]);
+    has_keys(&depth, &["per_image"]);
+    assert_eq!(depth["rmse_m"], 0.0);
+    let images = sequence.join("image");
+    let views = document(&["eval", "views", "--gt", text(&images), "--pred", text(&images)]);
+    has_keys(&views, &["images", "psnr", "ssim", "lpips", "per_image"]);
+    assert_eq!(views["lpips"], Value::Null);
+}
+
+#[test]
+fn the_published_scorers_list_of_two_predictions_is_scored_with_the_missing_one_named() {
+    let Some(official) = mb_testdata::find("official_scorer") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let meshes = dir.path().join("meshes/mine");
+    std::fs::create_dir_all(&meshes).unwrap();
+    std::fs::copy(official.join("preds/half.ply"), meshes.join("wedge.ply")).unwrap();
+    let list = dir.path().join("test_seqs.txt");
+    std::fs::write(&list, "wedge,absent").unwrap();
+    let out = dir.path().join("scores");
+    let meshes = dir.path().join("meshes");
+    let table = document(&[
+        "eval",
+        "surface",
+        "--method",
+        "mine",
+        "--root",
+        text(&official),
+        "--list",
+        text(&list),
+        "--meshes",
+        text(&meshes),
+        "-o",
+        text(&out),
+        "--points",
+        "20000",
+    ]);
+    assert_eq!(table["missing"][0]["sequence"], "absent");
+    assert!(out.join("data.csv").exists() && out.join("scores.csv").exists());
+}
