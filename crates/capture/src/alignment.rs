@@ -15,7 +15,7 @@ use crate::sequence::{read_json, write_json};
 pub enum AlignmentStage {
     /// PnP on clicked keypoints: the object's pose; cameras as the phone gave them.
     Keypoints,
-    /// Contour refinement: the object's pose; cameras as the phone gave them.
+    /// Contour refinement: the object's pose, and the drift of every camera as far as the edges show it.
     Refine,
     /// Bundle adjustment: the object's pose and every camera.
     Bundle,
