@@ -42,7 +42,9 @@ pub struct PosesScores {
     pub missing: Vec<FrameId>,
     /// Frames that only the prediction has.
     pub unpaired: Vec<FrameId>,
-    /// What a reader of the scores should know, with where the poses come from.
+    /// Where the poses come from, where that is not `pose/` alone.
+    pub sources: Vec<String>,
+    /// What a reader of the scores should know.
     pub warnings: Vec<String>,
 }
 
@@ -125,7 +127,7 @@ pub fn evaluate_poses(gt: &Path, pred: &Path) -> Result<PosesScores> {
         match folder.alignment() {
             Some((path, alignment)) if !alignment.frames.is_empty() => {
                 let count = alignment.frames.len();
-                scores.warnings.push(format!("{side} poses: {count} from {}", path.display()));
+                scores.sources.push(format!("{side} poses: {count} from {}", path.display()));
             }
             Some(_) => {}
             None => scores.warnings.push(format!(
@@ -206,6 +208,7 @@ pub fn score_poses(pairs: &[PosePair], object: Option<&ObjectPair>) -> Result<Po
         rpe: rpe.errors(),
         missing: Vec::new(),
         unpaired: Vec::new(),
+        sources: Vec::new(),
         warnings,
     })
 }

@@ -60,6 +60,10 @@ pub struct Tsdf {
     #[arg(long, value_name = "MM", default_value_t = TsdfOptions::default().truncation_mm)]
     truncation: f64,
 
+    /// Depth further than this is ignored, metres
+    #[arg(long, value_name = "M", default_value_t = TsdfOptions::default().max_depth_m)]
+    max_depth: f64,
+
     /// Lowest confidence that counts: 0, 1 or 2
     #[arg(long, value_name = "C", default_value_t = TsdfOptions::default().min_confidence)]
     confidence: u8,
@@ -78,6 +82,7 @@ impl Tsdf {
         let options = TsdfOptions {
             voxel_size_mm: self.voxel,
             truncation_mm: self.truncation,
+            max_depth_m: self.max_depth,
             min_confidence: self.confidence,
             use_masks: self.masks,
             poses: match self.poses {
