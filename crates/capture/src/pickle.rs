@@ -5,7 +5,7 @@
 //! them, and refuses everything else. Protocols 0 to 5 (Python's `Lib/pickletools.py` documents the operations).
 //!
 //! Values live in one arena and refer to each other by index: sharing costs nothing, hostile nesting cannot overflow the
-//! stack, and memory is bounded by [`MAX_OPERATIONS`] and the size of the input.
+//! stack, and memory is bounded by `MAX_OPERATIONS` and the size of the input.
 
 mod machine;
 
@@ -14,7 +14,7 @@ use machine::Machine;
 /// A real mask takes about 200 operations.
 const MAX_OPERATIONS: usize = 1 << 20;
 
-/// Index of a value in [`Pickle::values`].
+/// Index of a value in `Pickle::values`.
 pub type Id = usize;
 
 /// What a pickle can hold here.

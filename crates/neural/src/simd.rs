@@ -1,6 +1,6 @@
 //! Vector arithmetic with run-time dispatch: one matrix product, and element-wise functions.
 //!
-//! Each kernel is written once, generic over [`Vector`] or as a plain loop, and compiled three times: for any
+//! Each kernel is written once, generic over `Vector` or as a plain loop, and compiled three times: for any
 //! processor, for AVX2 with FMA, and for AVX-512. The choice is made at run time. Sums are formed in the same order by
 //! any number of threads, so a result depends on the machine's instruction set but on nothing else.
 //!
