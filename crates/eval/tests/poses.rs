@@ -84,7 +84,8 @@ proptest! {
         for errors in [scores.pairwise, scores.rpe, scores.object.unwrap()] {
             prop_assert!(errors.translation_max_mm == 0.0 && errors.rotation_max_deg < 1e-6, "{:?}", errors);
         }
-        prop_assert!(scores.ate_rmse_mm < 1e-9 && scores.ate_rotation_mean_deg < 180.0);
+        // Two cameras lie on a line, and the decomposition of a rank-one matrix keeps half of the digits.
+        prop_assert!(scores.ate_rmse_mm < 1e-3 && scores.ate_rotation_mean_deg < 180.0);
     }
 
     #[test]
