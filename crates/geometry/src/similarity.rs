@@ -67,12 +67,20 @@ fn umeyama<To, From>(
     let svd = covariance.svd(true, true);
     let (u, v_t) = (svd.u?, svd.v_t?);
     // Two directions must carry spread, or the rotation about the line is free.
-    let is_unique = n >= 3 && svd.singular_values[1] > 1e-12 * svd.singular_values[0].max(f64::MIN_POSITIVE);
+    let is_unique = n >= 3 && svd.singular_values[1] > 1e-7 * svd.singular_values[0].max(f64::MIN_POSITIVE);
     let mut sign = Vector3::new(1.0, 1.0, 1.0);
     if (u * v_t).determinant() < 0.0 {
         sign.z = -1.0;
     }
-    let rotation = Rotation3::from_matrix_unchecked(u * Matrix3::from_diagonal(&sign) * v_t);
+    let rotation = if is_unique {
+        Rotation3::from_matrix_unchecked(u * Matrix3::from_diagonal(&sign) * v_t)
+    } else {
+        // On a line the decomposition means little: turn the direction of the point farthest out into its partner's.
+        let offset = |i: usize| (points_in_from[i].coords - mean_from, points_in_to[i].coords - mean_to);
+        let farthest = (0..n).max_by(|&i, &j| offset(i).0.norm().total_cmp(&offset(j).0.norm())).unwrap_or(0);
+        let (from, to) = offset(farthest);
+        Rotation3::rotation_between(&from, &to).unwrap_or_else(Rotation3::identity)
+    };
     let scale = if with_scale { svd.singular_values.dot(&sign) / variance_from } else { 1.0 };
     if !(scale > 0.0 && scale.is_finite()) {
         return None;
