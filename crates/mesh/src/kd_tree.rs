@@ -5,7 +5,8 @@ use nalgebra::Point3;
 /// Points per leaf, at most.
 const LEAF: usize = 10;
 
-/// A balanced k-d tree over points (Bentley 1975), for exact nearest neighbours.
+/// A balanced k-d tree over points (Bentley 1975), for exact nearest neighbours. Every node keeps the box of its points:
+/// queries far from a surface are common, and cells that reach into empty space would turn few of them away.
 ///
 /// Points that are not finite are left out: they are never the nearest of anything.
 pub struct KdTree {
@@ -13,22 +14,54 @@ pub struct KdTree {
     points: Vec<[f64; 3]>,
     /// Index in the input of each entry of `points`.
     indices: Vec<u32>,
-    /// Splits of the inner nodes of a complete binary tree: node 1 is the root, 2k and 2k + 1 are the children of k.
-    splits: Vec<Split>,
+    /// Boxes of the nodes of a complete binary tree: node 1 is the root, 2k and 2k + 1 are the children of k, and the
+    /// second half are leaves.
+    boxes: Vec<PointBox>,
 }
 
-#[derive(Clone, Copy, Default)]
-struct Split {
-    at: f64,
-    axis: u32,
+/// The least and the largest coordinates of some points.
+#[derive(Clone, Copy)]
+struct PointBox {
+    min: [f64; 3],
+    max: [f64; 3],
+}
+
+impl PointBox {
+    const EMPTY: Self = Self { min: [f64::INFINITY; 3], max: [f64::NEG_INFINITY; 3] };
+
+    fn of(entries: &[([f64; 3], u32)]) -> Self {
+        let mut bounds = Self::EMPTY;
+        for (p, _) in entries {
+            for axis in 0..3 {
+                bounds.min[axis] = bounds.min[axis].min(p[axis]);
+                bounds.max[axis] = bounds.max[axis].max(p[axis]);
+            }
+        }
+        bounds
+    }
+
+    fn longest_axis(&self) -> usize {
+        let extent = |axis: usize| self.max[axis] - self.min[axis];
+        if extent(0) >= extent(1) && extent(0) >= extent(2) { 0 } else { 1 + usize::from(extent(2) > extent(1)) }
+    }
+
+    /// Squared distance of a point, 0 inside.
+    #[inline]
+    fn distance_sq(&self, p: &[f64; 3]) -> f64 {
+        let along = |axis: usize| {
+            let (before, beyond) = (self.min[axis] - p[axis], p[axis] - self.max[axis]);
+            let outside = if before > beyond { before } else { beyond };
+            if outside > 0.0 { outside } else { 0.0 }
+        };
+        let (x, y, z) = (along(0), along(1), along(2));
+        x * x + y * y + z * z
+    }
 }
 
 /// A subtree that is still to be visited.
 #[derive(Clone, Copy)]
 struct Waiting {
     distance_sq: f64,
-    /// Distance from the query to the subtree's cell along each axis.
-    offset: [f64; 3],
     node: u32,
     from: u32,
     to: u32,
@@ -49,14 +82,12 @@ impl KdTree {
             .map(|(index, p)| (p.coords.into(), index as u32))
             .collect();
         let leaves = entries.len().div_ceil(LEAF).next_power_of_two();
-        let mut splits = vec![Split::default(); leaves];
-        let levels = leaves.trailing_zeros();
-        let nodes = split(&mut entries, levels);
-        for (node, at) in nodes {
-            splits[node as usize] = at;
+        let mut boxes = vec![PointBox::EMPTY; 2 * leaves];
+        for (node, bounds) in split(&mut entries, leaves.trailing_zeros()) {
+            boxes[node as usize] = bounds;
         }
         let (points, indices) = entries.into_iter().unzip();
-        Self { points, indices, splits }
+        Self { points, indices, boxes }
     }
 
     /// Number of points that can be found.
@@ -107,43 +138,41 @@ impl KdTree {
         found
     }
 
-    /// Calls `point(index, squared distance, limit)` for every point of every leaf whose cell is within the squared
+    /// Calls `point(index, squared distance, limit)` for every point of every leaf whose box is within the squared
     /// distance `limit_sq`, which `point` may lower on the way; near leaves come first.
     fn visit(&self, query: &[f64; 3], limit_sq: &mut f64, mut point: impl FnMut(u32, f64, &mut f64)) {
-        let root = Waiting { distance_sq: 0.0, offset: [0.0; 3], node: 1, from: 0, to: self.points.len() as u32 };
+        let leaves = self.boxes.len() / 2;
+        let root = Waiting { distance_sq: 0.0, node: 1, from: 0, to: self.points.len() as u32 };
         // A complete tree of 2^32 points is at most 32 deep, and each level leaves at most one subtree waiting.
         let mut stack = [root; 34];
         let mut waiting = 1;
         while waiting > 0 {
             waiting -= 1;
-            let Waiting { distance_sq, offset, mut node, mut from, mut to } = stack[waiting];
-            if distance_sq > *limit_sq {
+            let mut next = stack[waiting];
+            if next.distance_sq > *limit_sq {
                 continue;
             }
-            while (node as usize) < self.splits.len() {
-                let Split { at, axis } = self.splits[node as usize];
-                let axis = axis as usize;
-                let middle = from + (to - from) / 2;
-                let side = query[axis] - at;
-                let mut far_offset = offset;
-                far_offset[axis] = side;
-                let far_sq = distance_sq - offset[axis] * offset[axis] + side * side;
-                let far = if side < 0.0 {
-                    let far = (2 * node + 1, middle, to);
-                    (node, to) = (2 * node, middle);
-                    far
-                } else {
-                    let far = (2 * node, from, middle);
-                    (node, from) = (2 * node + 1, middle);
-                    far
+            while (next.node as usize) < leaves {
+                let middle = next.from + (next.to - next.from) / 2;
+                let child = |node: u32, from: u32, to: u32| Waiting {
+                    distance_sq: self.boxes[node as usize].distance_sq(query),
+                    node,
+                    from,
+                    to,
                 };
-                if far_sq <= *limit_sq {
-                    stack[waiting] =
-                        Waiting { distance_sq: far_sq, offset: far_offset, node: far.0, from: far.1, to: far.2 };
+                let left = child(2 * next.node, next.from, middle);
+                let right = child(2 * next.node + 1, middle, next.to);
+                let (near, far) = if right.distance_sq < left.distance_sq { (right, left) } else { (left, right) };
+                if far.distance_sq <= *limit_sq {
+                    stack[waiting] = far;
                     waiting += 1;
                 }
+                next = near;
             }
-            let range = from as usize..to as usize;
+            if next.distance_sq > *limit_sq {
+                continue;
+            }
+            let range = next.from as usize..next.to as usize;
             for (p, &index) in self.points[range.clone()].iter().zip(&self.indices[range]) {
                 let (x, y, z) = (p[0] - query[0], p[1] - query[1], p[2] - query[2]);
                 point(index, x * x + y * y + z * z, limit_sq);
@@ -153,35 +182,25 @@ impl KdTree {
 }
 
 /// Reorders `entries` so that each of the `levels` levels of halves is split at its median along its longest side, and
-/// returns the splits by node number.
-fn split(entries: &mut [([f64; 3], u32)], levels: u32) -> Vec<(u32, Split)> {
-    fn recurse(entries: &mut [([f64; 3], u32)], node: u32, levels: u32) -> Vec<(u32, Split)> {
+/// returns the boxes by node number.
+fn split(entries: &mut [([f64; 3], u32)], levels: u32) -> Vec<(u32, PointBox)> {
+    fn recurse(entries: &mut [([f64; 3], u32)], node: u32, levels: u32) -> Vec<(u32, PointBox)> {
+        let bounds = PointBox::of(entries);
         if levels == 0 {
-            return Vec::new();
+            return vec![(node, bounds)];
         }
-        let mut min = [f64::INFINITY; 3];
-        let mut max = [f64::NEG_INFINITY; 3];
-        for (p, _) in entries.iter() {
-            for axis in 0..3 {
-                min[axis] = min[axis].min(p[axis]);
-                max[axis] = max[axis].max(p[axis]);
-            }
-        }
-        let extent = |axis: usize| max[axis] - min[axis];
-        let axis =
-            if extent(0) >= extent(1) && extent(0) >= extent(2) { 0 } else { 1 + usize::from(extent(2) > extent(1)) };
+        let axis = bounds.longest_axis();
         let middle = entries.len() / 2;
         entries.select_nth_unstable_by(middle, |a, b| a.0[axis].total_cmp(&b.0[axis]).then(a.1.cmp(&b.1)));
-        let here = (node, Split { at: entries[middle].0[axis], axis: axis as u32 });
         let (left, right) = entries.split_at_mut(middle);
         let mut build_left = || recurse(left, 2 * node, levels - 1);
         let mut build_right = || recurse(right, 2 * node + 1, levels - 1);
         // Small subtrees are not worth a task.
-        let (mut splits, right) =
+        let (mut boxes, right) =
             if levels > 8 { rayon::join(build_left, build_right) } else { (build_left(), build_right()) };
-        splits.extend(right);
-        splits.push(here);
-        splits
+        boxes.extend(right);
+        boxes.push((node, bounds));
+        boxes
     }
     recurse(entries, 1, levels)
 }

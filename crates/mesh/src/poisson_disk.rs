@@ -3,6 +3,8 @@
 //! Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets", Computer Graphics Forum 34(2), 2015, with the
 //! parameters and the weight of Open3D 0.19 (`SamplePointsPoissonDisk`), which the published scorer calls.
 
+use std::ops::Range;
+
 use mb_geometry::Aabb;
 use nalgebra::Point3;
 use rayon::prelude::*;
@@ -34,32 +36,35 @@ pub fn sample_poisson_disk(mesh: &TriangleMesh, n: usize, seed: u64) -> Vec<Poin
 fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64>> {
     let ratio = n as f64 / candidates.len() as f64;
     let floor = BETA * (1.0 - ratio.powf(GAMMA));
-    let (order, grid) = Grid::new(candidates, reach);
+    let (order, mut grid) = Grid::new(candidates, reach);
     let count = order.len();
-    let crowding = |squared: f64| {
-        // (1 - d / reach)^8, squared three times; distances are in units of the reach.
-        let w = 1.0 - squared.sqrt().max(floor);
-        let w = w * w;
-        let w = w * w;
-        w * w
-    };
-    let mut weights: Vec<f64> = (0..count)
+    let weights: Vec<f64> = (0..count)
         .into_par_iter()
         .with_min_len(4096)
         .map(|i| {
             let mut weight = 0.0;
-            grid.neighbours(i, |_, squared| weight += crowding(squared));
+            for run in grid.runs_around(i) {
+                weight = grid.points[run].iter().fold(weight, |sum, p| sum + p.crowding(&grid.points[i], floor));
+            }
             // The point itself is no neighbour.
-            weight - crowding(0.0)
+            weight - crowding(0.0, floor)
         })
         .collect();
+    for (point, weight) in grid.points.iter_mut().zip(weights) {
+        point.weight = weight;
+    }
 
-    let mut queue = Queue::new(&weights);
+    let mut queue = Queue::new(&grid.points);
     let mut kept = vec![true; count];
     for _ in n..count {
-        let Some(i) = queue.pop_most_crowded(&weights) else { break };
+        let Some(i) = queue.pop_most_crowded(&grid.points) else { break };
         kept[i as usize] = false;
-        grid.neighbours(i as usize, |j, squared| weights[j] -= crowding(squared));
+        let gone = grid.points[i as usize];
+        for run in grid.runs_around(i as usize) {
+            for p in &mut grid.points[run] {
+                p.weight -= p.crowding(&gone, floor);
+            }
+        }
     }
     let mut survivors: Vec<u32> = order.into_iter().zip(kept).filter(|(_, kept)| *kept).map(|(i, _)| i).collect();
     survivors.sort_unstable();
@@ -80,16 +85,16 @@ struct Queue {
 }
 
 impl Queue {
-    fn new(weights: &[f64]) -> Self {
-        let most = weights.iter().copied().fold(0.0, f64::max);
-        let count = (weights.len() / 64).clamp(1, 1 << 14);
+    fn new(points: &[Candidate]) -> Self {
+        let most = points.iter().map(|p| p.weight).fold(0.0, f64::max);
+        let count = (points.len() / 64).clamp(1, 1 << 14);
         let mut queue = Self {
             buckets: vec![Vec::new(); count + 1],
             step: (most / count as f64).max(f64::MIN_POSITIVE),
             heap: Vec::new(),
         };
-        for (i, &weight) in weights.iter().enumerate() {
-            let bucket = queue.bucket_of(weight);
+        for (i, point) in points.iter().enumerate() {
+            let bucket = queue.bucket_of(point.weight);
             queue.buckets[bucket].push(i as u32);
         }
         queue
@@ -101,11 +106,11 @@ impl Queue {
     }
 
     /// Takes out the point with the largest weight, of equal ones the lowest number.
-    fn pop_most_crowded(&mut self, weights: &[f64]) -> Option<u32> {
+    fn pop_most_crowded(&mut self, points: &[Candidate]) -> Option<u32> {
         loop {
             let Some(&(old, i)) = self.heap.first() else {
                 for i in self.buckets.pop()? {
-                    let weight = weights[i as usize];
+                    let weight = points[i as usize].weight;
                     match self.bucket_of(weight) {
                         lower if lower < self.buckets.len() => self.buckets[lower].push(i),
                         _ => self.heap.push((weight, i)),
@@ -116,7 +121,7 @@ impl Queue {
                 }
                 continue;
             };
-            let weight = weights[i as usize];
+            let weight = points[i as usize].weight;
             let bucket = self.bucket_of(weight);
             if weight < old && bucket >= self.buckets.len() {
                 self.heap[0].0 = weight;
@@ -151,11 +156,39 @@ fn sift_down(heap: &mut [(f64, u32)], mut i: usize) {
     }
 }
 
+/// A point, and how crowded it is. Kept together: the elimination jumps through memory, so what counts is how many
+/// places it touches.
+#[derive(Clone, Copy)]
+struct Candidate {
+    at: [f64; 3],
+    weight: f64,
+}
+
+impl Candidate {
+    /// How much two points crowd each other.
+    #[inline]
+    fn crowding(&self, other: &Candidate, floor: f64) -> f64 {
+        let [x, y, z] = [0, 1, 2].map(|axis| self.at[axis] - other.at[axis]);
+        crowding(x * x + y * y + z * z, floor)
+    }
+}
+
+/// (1 - d / reach)^8 from the squared distance in reaches, 0 beyond the reach.
+#[inline]
+fn crowding(squared: f64, floor: f64) -> f64 {
+    let d = squared.sqrt();
+    let w = 1.0 - if d > floor { d } else { floor };
+    let w = if w > 0.0 { w } else { 0.0 };
+    let w = w * w;
+    let w = w * w;
+    w * w
+}
+
 /// Points sorted into cubic cells at least as wide as the reach, so that all neighbours lie in 27 cells. Only cells with
 /// points are stored, sorted by z, y, x: three cells in a row along x are one run of points.
 struct Grid {
     /// Points in cell order, in units of the reach, from the corner of the grid.
-    points: Vec<[f64; 3]>,
+    points: Vec<Candidate>,
     cell_of_point: Vec<u32>,
     /// For each cell, the nine runs of points (first, end) in the cells around it.
     runs: Vec<[(u32, u32); 9]>,
@@ -209,24 +242,14 @@ impl Grid {
             }
         }
         let order: Vec<u32> = sorted.into_iter().map(|(_, i)| i).collect();
-        let points = order.iter().map(|&i| in_reaches(&points[i as usize]).into()).collect();
+        let points =
+            order.iter().map(|&i| Candidate { at: in_reaches(&points[i as usize]).into(), weight: 0.0 }).collect();
         (order, Self { points, cell_of_point, runs })
     }
 
-    /// Calls `neighbour(index in cell order, squared distance in reaches)` for every point nearer than the reach,
-    /// point `i` itself included.
-    fn neighbours(&self, i: usize, mut neighbour: impl FnMut(usize, f64)) {
-        let [x, y, z] = self.points[i];
-        for &(first, end) in &self.runs[self.cell_of_point[i] as usize] {
-            let run = first as usize..end as usize;
-            for (j, p) in run.clone().zip(&self.points[run]) {
-                let (dx, dy, dz) = (p[0] - x, p[1] - y, p[2] - z);
-                let squared = dx * dx + dy * dy + dz * dz;
-                if squared < 1.0 {
-                    neighbour(j, squared);
-                }
-            }
-        }
+    /// The runs of points around point `i`, itself included.
+    fn runs_around(&self, i: usize) -> [Range<usize>; 9] {
+        self.runs[self.cell_of_point[i] as usize].map(|(first, end)| first as usize..end as usize)
     }
 }
 

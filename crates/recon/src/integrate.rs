@@ -3,10 +3,11 @@
 use mb_geometry::{Camera, Intrinsics, Rigid3, World};
 use mb_image::{DepthImage, RgbImage};
 use mb_job::{Error, Result};
+use multiversion::multiversion;
 use nalgebra::{Matrix3, Point2, Vector3};
 use rayon::prelude::*;
 
-use crate::volume::{Block, SIDE, VOXELS, too_large};
+use crate::volume::{Block, SIDE, too_large};
 
 /// Blocks further from the origin than this many blocks are refused; beyond it single precision loses voxels.
 const MAX_BLOCK_COORD: f64 = (1 << 26) as f64;
@@ -28,22 +29,38 @@ fn is_depth(z: f32) -> bool {
 const TILE: usize = 16;
 
 /// The largest depth in each tile of a depth map, 0 where a tile has no depth.
-struct FarthestDepth {
+pub(crate) struct FarthestDepth {
     columns: usize,
     tiles: Vec<f32>,
 }
 
 impl FarthestDepth {
-    fn of(depth: &DepthImage) -> Self {
+    pub fn of(depth: &DepthImage) -> Self {
         let columns = depth.width().div_ceil(TILE);
         let mut tiles = vec![0.0; columns * depth.height().div_ceil(TILE)];
-        for (y, row) in depth.data().chunks_exact(depth.width().max(1)).enumerate() {
-            let tiles = &mut tiles[y / TILE * columns..][..columns];
-            for (tile, pixels) in tiles.iter_mut().zip(row.chunks(TILE)) {
-                *tile = pixels.iter().fold(*tile, |most, &z| if z > most { z } else { most });
-            }
+        if columns > 0 {
+            let bands = depth.data().par_chunks(TILE * depth.width());
+            tiles.par_chunks_mut(columns).zip(bands).for_each(|(tiles, band)| {
+                farthest_in_band(tiles, band, depth.width());
+            });
         }
         Self { columns, tiles }
+    }
+}
+
+/// The largest depth of each tile of a band of rows.
+#[multiversion(targets("x86_64+avx2"))]
+fn farthest_in_band(tiles: &mut [f32], band: &[f32], width: usize) {
+    let mut most = [0.0f32; TILE];
+    for (index, tile) in tiles.iter_mut().enumerate() {
+        most.fill(0.0);
+        for row in band.chunks_exact(width) {
+            let pixels = &row[index * TILE..width.min((index + 1) * TILE)];
+            for (most, &z) in most.iter_mut().zip(pixels) {
+                *most = if z > *most { z } else { *most };
+            }
+        }
+        *tile = most.iter().fold(0.0, |a, &b| if b > a { b } else { a });
     }
 }
 
@@ -53,6 +70,7 @@ impl FarthestDepth {
 /// stretch of its ray is grown sideways by the stride.
 pub(crate) fn touched_blocks(
     view: &FrameView,
+    farthest: &FarthestDepth,
     voxel_size_m: f64,
     truncation_m: f64,
     limit: usize,
@@ -60,79 +78,142 @@ pub(crate) fn touched_blocks(
     let size = view.depth.size();
     let world_from_cam = view.cam_from_world.inverse();
     let focal = view.intrinsics.fx.min(view.intrinsics.fy);
-    let farthest = FarthestDepth::of(view.depth);
     let farthest_of_all = farthest.tiles.iter().copied().filter(|&z| is_depth(z)).fold(0.0, f32::max);
     let stride = ((voxel_size_m * focal / f64::from(farthest_of_all)) as usize).clamp(1, SIDE);
     let block_size = voxel_size_m * SIDE as f64;
 
-    let mark_row = |&y: &usize| -> Result<Vec<[i32; 3]>> {
-        let mut found = Vec::new();
-        // The block ranges that the pieces of the previous ray touched: neighbouring rays mostly touch the same.
-        let mut previous = Vec::new();
-        for x in (0..size.width).step_by(stride) {
-            let z = view.depth[(x, y)];
+    // In blocks: a point at depth z on the ray of pixel (x, y) is origin + z * (first + x * across).
+    let in_blocks = |v: Vector3<f64>| world_from_cam.rotate(&v) / block_size;
+    let origin = world_from_cam.translation() / block_size;
+    let across = in_blocks(Vector3::new(1.0 / view.intrinsics.fx, 0.0, 0.0));
+
+    let mark_row = |y: usize, found: &mut FoundBlocks| -> Result<()> {
+        let first = in_blocks(view.intrinsics.cam_from_img(&Point2::new(0.0, y as f64), 1.0).coords);
+        // The blocks along the previous ray: neighbouring rays mostly touch the same.
+        let mut previous = None;
+        for (x, &z) in view.depth.row(y).iter().enumerate().step_by(stride) {
             if !is_depth(z) {
                 continue;
             }
             let z = f64::from(z);
-            let ray = view.intrinsics.ray(&Point2::new(x as f64, y as f64), &world_from_cam);
-            let near = (z - truncation_m).max(0.0);
-            let far = z + truncation_m;
-            let pieces = ((far - near) * ray.direction.norm() / (0.5 * block_size)).ceil().max(1.0) as usize;
-            let margin = stride as f64 * z / focal;
-            previous.resize(pieces, None);
-            let mut start = ray.at(near);
-            for (i, previous) in previous.iter_mut().enumerate() {
-                let end = ray.at(near + (far - near) * (i + 1) as f64 / pieces as f64);
-                let lowest = start.inf(&end).coords.add_scalar(-margin) / block_size;
-                let highest = start.sup(&end).coords.add_scalar(margin) / block_size;
-                if !(lowest.min() > -MAX_BLOCK_COORD && highest.max() < MAX_BLOCK_COORD) {
-                    return Err(Error::Failed(format!(
-                        "a surface lies {:.0} m from the origin, too far for voxels of {} mm; check the unit of the poses",
-                        end.coords.norm(),
-                        voxel_size_m * 1e3
-                    )));
+            let direction = first + across * x as f64;
+            let (near, far) = ((z - truncation_m).max(0.0), z + truncation_m);
+            let margin = stride as f64 * z / focal / block_size;
+            let start = origin + direction * near;
+            let end = origin + direction * far;
+            if !start.iter().chain(&end).all(|v| v.abs() + margin < MAX_BLOCK_COORD) {
+                return Err(Error::Failed(format!(
+                    "a surface lies {:.0} m from the origin, too far for voxels of {} mm; check the unit of the poses",
+                    end.norm() * block_size,
+                    voxel_size_m * 1e3
+                )));
+            }
+            let whole = BlockRange::around(&start, &end, margin);
+            // A single row of blocks is touched all along; in a wider range the pieces of the ray decide.
+            if whole.is_row() {
+                if previous != Some(whole) {
+                    found.add(whole)?;
                 }
-                start = end;
-                let range = (lowest.map(floor), highest.map(floor));
-                if *previous == Some(range) {
-                    continue;
+            } else {
+                let pieces = (2.0 * (far - near) * direction.norm()).ceil().max(1.0);
+                let mut start = start;
+                for i in 0..pieces as usize {
+                    let end = origin + direction * (near + (far - near) * (i + 1) as f64 / pieces);
+                    found.add(BlockRange::around(&start, &end, margin))?;
+                    start = end;
                 }
-                *previous = Some(range);
-                let (low, high) = range;
-                // A depth map whose pixels are many blocks wide cannot be fused at this voxel size.
-                let count = (0..3).map(|a| (high[a] - low[a] + 1) as f64).product::<f64>();
-                if found.len() as f64 + count > limit as f64 {
-                    found.sort_unstable();
-                    found.dedup();
-                    if found.len() as f64 + count > limit as f64 {
-                        return Err(too_large(voxel_size_m));
-                    }
-                }
-                for bz in low.z..=high.z {
-                    for by in low.y..=high.y {
-                        found.extend((low.x..=high.x).map(|bx| [bx, by, bz]));
+            }
+            previous = Some(whole);
+        }
+        Ok(())
+    };
+    let rows: Vec<usize> = (0..size.height).step_by(stride).collect();
+    let mark_rows = |rows: &[usize]| -> Result<Vec<[i32; 3]>> {
+        let mut found = FoundBlocks::new(limit, voxel_size_m);
+        rows.iter().try_for_each(|&y| mark_row(y, &mut found))?;
+        Ok(found.into_sorted())
+    };
+    let found: Vec<Vec<[i32; 3]>> = rows.par_chunks(16).map(mark_rows).collect::<Result<_>>()?;
+    let mut touched = found.concat();
+    touched.sort_unstable();
+    touched.dedup();
+    if touched.len() > limit {
+        return Err(too_large(voxel_size_m));
+    }
+    Ok(touched)
+}
+
+/// A box of blocks, both ends included.
+#[derive(Clone, Copy, PartialEq)]
+struct BlockRange {
+    low: Vector3<i32>,
+    high: Vector3<i32>,
+}
+
+impl BlockRange {
+    /// The blocks within `margin` of the box that two points span, all in blocks.
+    fn around(a: &Vector3<f64>, b: &Vector3<f64>, margin: f64) -> Self {
+        // Plain comparisons: these compile to single instructions, `f64::min` does not.
+        let low = a.zip_map(b, |a, b| if a < b { a } else { b });
+        let high = a.zip_map(b, |a, b| if a > b { a } else { b });
+        Self { low: low.map(|v| floor(v - margin)), high: high.map(|v| floor(v + margin)) }
+    }
+
+    /// Whether the blocks lie in one line along an axis.
+    fn is_row(&self) -> bool {
+        (0..3).filter(|&axis| self.low[axis] < self.high[axis]).count() <= 1
+    }
+
+    fn count(&self) -> f64 {
+        (0..3).map(|axis| f64::from(self.high[axis] - self.low[axis] + 1)).product()
+    }
+}
+
+/// A list of blocks that forgets most repetitions as they come.
+struct FoundBlocks {
+    blocks: Vec<[i32; 3]>,
+    /// The block that last fell into each slot.
+    recent: [[i32; 3]; 256],
+    limit: usize,
+    voxel_size_m: f64,
+}
+
+impl FoundBlocks {
+    /// A list of at most `limit` blocks.
+    fn new(limit: usize, voxel_size_m: f64) -> Self {
+        Self { blocks: Vec::new(), recent: [[i32::MAX; 3]; 256], limit, voxel_size_m }
+    }
+
+    fn add(&mut self, range: BlockRange) -> Result<()> {
+        // A depth map whose pixels are many blocks wide cannot be fused at this voxel size.
+        if self.blocks.len() as f64 + range.count() > self.limit as f64 {
+            self.blocks.sort_unstable();
+            self.blocks.dedup();
+            if self.blocks.len() as f64 + range.count() > self.limit as f64 {
+                return Err(too_large(self.voxel_size_m));
+            }
+        }
+        let BlockRange { low, high } = range;
+        for z in low.z..=high.z {
+            for y in low.y..=high.y {
+                for x in low.x..=high.x {
+                    let slot = &mut self.recent[((x & 7) | (y & 7) << 3 | (z & 3) << 6) as usize];
+                    if *slot != [x, y, z] {
+                        *slot = [x, y, z];
+                        self.blocks.push([x, y, z]);
                     }
                 }
             }
         }
-        found.sort_unstable();
-        found.dedup();
-        Ok(found)
-    };
-    // Rows are merged in batches, so that memory stays bounded for depth maps that touch far too much.
-    let rows: Vec<usize> = (0..size.height).step_by(stride).collect();
-    let mut touched: Vec<[i32; 3]> = Vec::new();
-    for batch in rows.chunks(64) {
-        let found: Vec<Vec<[i32; 3]>> = batch.par_iter().map(mark_row).collect::<Result<_>>()?;
-        found.into_iter().for_each(|blocks| touched.extend(blocks));
-        touched.sort_unstable();
-        touched.dedup();
-        if touched.len() > limit {
-            return Err(too_large(voxel_size_m));
-        }
+        Ok(())
     }
-    Ok(touched)
+
+    /// Each block once, in ascending order.
+    fn into_sorted(mut self) -> Vec<[i32; 3]> {
+        self.blocks.sort_unstable();
+        self.blocks.dedup();
+        self.blocks
+    }
 }
 
 /// The largest integer not above `x`, for `x` within [`MAX_BLOCK_COORD`]; the library's is a call on older processors.
@@ -143,20 +224,24 @@ fn floor(x: f64) -> i32 {
 
 impl<'a> FrameView<'a> {
     /// Everything about the frame that a block's update needs, in single precision.
-    pub fn updater(&self, voxel_size_m: f64, truncation_m: f64) -> BlockUpdater<'a> {
+    pub fn updater(&self, farthest: FarthestDepth, voxel_size_m: f64, truncation_m: f64) -> BlockUpdater<'a> {
         let size = self.depth.size();
         let color = self.color.map(|image| {
             let scale = |to: usize, from: usize| to as f32 / from as f32;
             (image, [scale(image.width(), size.width), scale(image.height(), size.height)])
         });
+        let steps: Matrix3<f32> = (self.cam_from_world.rotation_matrix() * voxel_size_m).cast();
         BlockUpdater {
             depth: self.depth,
-            farthest: FarthestDepth::of(self.depth),
+            farthest,
             color,
             focal: [self.intrinsics.fx as f32, self.intrinsics.fy as f32],
             center: [self.intrinsics.cx as f32, self.intrinsics.cy as f32],
             cam_from_world: *self.cam_from_world,
-            steps: (self.cam_from_world.rotation_matrix() * voxel_size_m).cast(),
+            steps,
+            layer: std::array::from_fn(|axis| {
+                std::array::from_fn(|i| steps[(axis, 0)] * (i % SIDE) as f32 + steps[(axis, 1)] * (i / SIDE) as f32)
+            }),
             voxel_size_m,
             truncation_m: truncation_m as f32,
         }
@@ -174,31 +259,20 @@ pub(crate) struct BlockUpdater<'a> {
     cam_from_world: Rigid3<Camera, World>,
     /// Columns: one voxel along x, y, z of the world, in the camera frame.
     steps: Matrix3<f32>,
+    /// Camera x, y, z of the voxels of a layer, from its first.
+    layer: [Layer; 3],
     voxel_size_m: f64,
     truncation_m: f32,
 }
 
 impl BlockUpdater<'_> {
-    /// Updates the voxels of a block that this frame sees.
-    pub fn update(&self, block: &mut Block) {
-        let corner = block.coord.map(|c| f64::from(c) * SIDE as f64 * self.voxel_size_m);
-        let corner: Vector3<f32> = (self.cam_from_world * nalgebra::Point3::from(corner)).coords.cast();
-        if !self.may_see(&corner) {
-            return;
-        }
-        let (dx, dy, dz) = (self.steps.column(0), self.steps.column(1), self.steps.column(2));
-        for row in 0..VOXELS / SIDE {
-            let start = corner + dy * (row % SIDE) as f32 + dz * (row / SIDE) as f32;
-            // Project the whole row first: plain arithmetic on eight numbers, which the compiler does at once.
-            let z: [f32; SIDE] = std::array::from_fn(|i| start.z + dx[2] * i as f32);
-            let u: [f32; SIDE] =
-                std::array::from_fn(|i| self.focal[0] * (start.x + dx[0] * i as f32) / z[i] + self.center[0]);
-            let v: [f32; SIDE] =
-                std::array::from_fn(|i| self.focal[1] * (start.y + dx[1] * i as f32) / z[i] + self.center[1]);
-            for i in 0..SIDE {
-                if z[i] > 0.0 {
-                    self.update_voxel(block, row * SIDE + i, z[i], u[i], v[i]);
-                }
+    /// Updates the voxels of blocks that this frame sees.
+    pub fn update(&self, blocks: &mut [Block]) {
+        for block in blocks {
+            let corner = block.coord.map(|c| f64::from(c) * SIDE as f64 * self.voxel_size_m);
+            let corner: Vector3<f32> = (self.cam_from_world * nalgebra::Point3::from(corner)).coords.cast();
+            if self.may_see(&corner) {
+                update_block(self, block, &corner);
             }
         }
     }
@@ -233,53 +307,115 @@ impl BlockUpdater<'_> {
         })
     }
 
-    /// Averages what the frame shows at image position (`u`, `v`) into a voxel at depth `voxel_z`.
-    #[inline(always)]
-    fn update_voxel(&self, block: &mut Block, voxel: usize, voxel_z: f32, u: f32, v: f32) {
-        let Some(z) = self.depth_at(u, v) else { return };
-        let ahead = z - voxel_z;
-        if ahead < -self.truncation_m {
-            return;
-        }
-        let weight = block.weight[voxel] + 1.0;
-        let share = 1.0 / weight;
-        let distance = &mut block.distance_m[voxel];
-        *distance += (ahead.min(self.truncation_m) - *distance) * share;
-        block.weight[voxel] = weight;
-        if let (Some((image, scale)), Some(color)) = (self.color, &mut block.color) {
-            let pixel = |at: f32, scale: f32, count: usize| (((at + 0.5) * scale) as usize).min(count - 1);
-            let seen = image[(pixel(u, scale[0], image.width()), pixel(v, scale[1], image.height()))];
-            for (average, seen) in color[voxel].iter_mut().zip(seen) {
-                *average += (f32::from(seen) - *average) * share;
-            }
+    /// Averages the photograph's pixel at image position (`u`, `v`) into a voxel's colour.
+    fn update_color(&self, color: &mut [f32; 3], u: f32, v: f32, share: f32) {
+        let Some((image, scale)) = self.color else { return };
+        let pixel = |at: f32, scale: f32, count: usize| (((at + 0.5) * scale) as usize).min(count - 1);
+        let seen = image[(pixel(u, scale[0], image.width()), pixel(v, scale[1], image.height()))];
+        for (average, seen) in color.iter_mut().zip(seen) {
+            *average += (f32::from(seen) - *average) * share;
         }
     }
+}
 
-    /// Depth at a position in the image: interpolated on smooth surfaces, else that of the nearest pixel.
-    #[inline(always)]
-    fn depth_at(&self, u: f32, v: f32) -> Option<f32> {
-        let (width, height) = (self.depth.width(), self.depth.height());
-        // Also false for NaN.
-        if !(u >= -0.5 && v >= -0.5 && u < width as f32 - 0.5 && v < height as f32 - 0.5) {
-            return None;
+/// Voxels of a block's layer, which are computed together.
+const LAYER: usize = SIDE * SIDE;
+type Layer = [f32; LAYER];
+
+/// Averages a frame into a block whose first voxel is at `corner` (camera frame).
+///
+/// Compiled for wider vectors too; nothing is contracted to fused operations, so every processor gives the same bits.
+/// Each loop does one thing to a whole layer, which is what the compiler turns into vectors.
+#[multiversion(targets("x86_64+avx2"))]
+fn update_block(frame: &BlockUpdater, block: &mut Block, corner: &Vector3<f32>) {
+    let (distances, _) = block.distance_m.as_chunks_mut::<LAYER>();
+    let (weights, _) = block.weight.as_chunks_mut::<LAYER>();
+    let [across, down, along] = &frame.layer;
+    let (mut z, mut u, mut v, mut seen, mut share) =
+        ([0.0; LAYER], [0.0; LAYER], [0.0; LAYER], [0.0; LAYER], [0.0; LAYER]);
+    for (number, (distance, weight)) in distances.iter_mut().zip(weights).enumerate() {
+        let start = corner + frame.steps.column(2) * number as f32;
+        for i in 0..LAYER {
+            z[i] = start.z + along[i];
+            u[i] = frame.focal[0] * (start.x + across[i]) / z[i] + frame.center[0];
+            v[i] = frame.focal[1] * (start.y + down[i]) / z[i] + frame.center[1];
         }
-        let data = self.depth.data();
-        if width > 1 && height > 1 {
-            // In the outer half of a border pixel this extrapolates.
-            let (x, y) = ((u as usize).min(width - 2), (v as usize).min(height - 2));
-            let (a, b) = (u - x as f32, v - y as f32);
-            let first = y * width + x;
-            let [p, q] = [data[first], data[first + 1]];
-            let [r, s] = [data[first + width], data[first + width + 1]];
-            let low = p.min(q).min(r.min(s));
-            let high = p.max(q).max(r.max(s));
-            if low > 0.0 && high - low < self.truncation_m {
-                let top = p + (q - p) * a;
-                let bottom = r + (s - r) * a;
-                return Some(top + (bottom - top) * b);
+        if !depth_at(frame.depth, frame.truncation_m, (&z, &u, &v), &mut seen) {
+            continue;
+        }
+        for i in 0..LAYER {
+            let ahead = seen[i] - z[i];
+            // Also false where nothing is seen, which is far nearer than any voxel.
+            let counts = ahead >= -frame.truncation_m;
+            let ahead = if ahead < frame.truncation_m { ahead } else { frame.truncation_m };
+            let grown = weight[i] + 1.0;
+            share[i] = if counts { 1.0 / grown } else { 0.0 };
+            weight[i] = if counts { grown } else { weight[i] };
+            let change = (ahead - distance[i]) * share[i];
+            distance[i] += if counts { change } else { 0.0 };
+        }
+        if let Some(colors) = &mut block.color {
+            for (i, color) in colors[number * LAYER..][..LAYER].iter_mut().enumerate() {
+                if share[i] > 0.0 {
+                    frame.update_color(color, u[i], v[i], share[i]);
+                }
             }
         }
-        let nearest = data[(v + 0.5) as usize * width + (u + 0.5) as usize];
-        is_depth(nearest).then_some(nearest)
     }
+}
+
+/// Depth where voxels at depths `z` and pixels (`u`, `v`) are seen: interpolated on smooth surfaces, else that of the
+/// nearest pixel; minus infinity where there is none. False where none of them lies in the image.
+#[inline(always)]
+fn depth_at(depth: &DepthImage, jump_m: f32, (z, u, v): (&Layer, &Layer, &Layer), seen: &mut Layer) -> bool {
+    let (width, height) = (depth.width(), depth.height());
+    let data = depth.data();
+    let (right, bottom) = (width as f32 - 0.5, height as f32 - 0.5);
+    // In the outer half of a border pixel the interpolation extrapolates.
+    let (last_x, last_y) = (width.saturating_sub(2) as f32, height.saturating_sub(2) as f32);
+    let clamp = |x: f32, most: f32| {
+        let x = if x > 0.0 { x } else { 0.0 };
+        if x < most { x } else { most }
+    };
+    let mut inside = [0u32; LAYER];
+    let mut any = 0;
+    let (mut first, mut a, mut b) = ([0i32; LAYER], [0.0; LAYER], [0.0; LAYER]);
+    for i in 0..LAYER {
+        // All false for NaN.
+        let within = (z[i] > 0.0) & (u[i] >= -0.5) & (u[i] < right) & (v[i] >= -0.5) & (v[i] < bottom);
+        inside[i] = u32::from(within);
+        any |= inside[i];
+        let (x, y) = (clamp(u[i], last_x) as i32, clamp(v[i], last_y) as i32);
+        (a[i], b[i]) = (u[i] - x as f32, v[i] - y as f32);
+        first[i] = y * width as i32 + x;
+    }
+    if any == 0 {
+        return false;
+    }
+    // An image of one column or row has no neighbours there.
+    let (next_x, next_y) = (usize::from(width > 1), if height > 1 { width } else { 0 });
+    let mut corners = [[0.0; LAYER]; 4];
+    for i in 0..LAYER {
+        let around = &data[first[i] as usize..][..=next_y + next_x];
+        (corners[0][i], corners[1][i]) = (around[0], around[next_x]);
+        (corners[2][i], corners[3][i]) = (around[next_y], around[next_y + next_x]);
+    }
+    let [p, q, r, s] = &corners;
+    let min = |a: f32, b: f32| if a < b { a } else { b };
+    let max = |a: f32, b: f32| if a > b { a } else { b };
+    for i in 0..LAYER {
+        let low = min(min(p[i], q[i]), min(r[i], s[i]));
+        let high = max(max(p[i], q[i]), max(r[i], s[i]));
+        let over = p[i] + (q[i] - p[i]) * a[i];
+        let under = r[i] + (s[i] - r[i]) * a[i];
+        let smooth = over + (under - over) * b[i];
+        let upper = if a[i] < 0.5 { p[i] } else { q[i] };
+        let lower = if a[i] < 0.5 { r[i] } else { s[i] };
+        let nearest = if b[i] < 0.5 { upper } else { lower };
+        let found = if (low > 0.0) & (high - low < jump_m) { smooth } else { nearest };
+        // Also false for NaN.
+        let counts = (inside[i] != 0) & (found > 0.0) & (found < f32::INFINITY);
+        seen[i] = if counts { found } else { f32::NEG_INFINITY };
+    }
+    true
 }
