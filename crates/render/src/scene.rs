@@ -92,11 +92,11 @@ impl Scene {
             |strip, (index, output)| {
                 strip.begin(index * STRIP, size.height);
                 for piece in pieces.iter().flat_map(|task| &task[index]) {
-                    let triangle = self.triangles[piece.triangle as usize];
-                    let seen = triangle.map(|v| &corners[v as usize]);
-                    if strip.hides(piece, seen) {
+                    if strip.hides(piece) {
                         continue;
                     }
+                    let triangle = self.triangles[piece.triangle as usize];
+                    let seen = triangle.map(|v| &corners[v as usize]);
                     let setup = match seen.iter().all(|c| c.is_in_front()) {
                         true => Setup::in_front(seen),
                         false => Setup::across(seen, triangle.map(homogeneous)),
@@ -139,13 +139,14 @@ impl Scene {
             let last = (first + CLUSTER).min(self.triangles.len());
             for (index, triangle) in (first as u32..).zip(&self.triangles[first..last]) {
                 let seen = triangle.map(|v| &corners[v as usize]);
-                let bounds = match seen.iter().filter(|c| c.is_in_front()).count() {
-                    3 => bounds_in_front(seen),
+                let (bounds, nearest) = match seen.iter().filter(|c| c.is_in_front()).count() {
+                    // The next number above, as rounding may have gone down.
+                    3 => (bounds_in_front(seen), (seen[0].w.max(seen[1].w).max(seen[2].w) as f32).next_up()),
                     0 => continue,
-                    _ => bounds_across(triangle.map(homogeneous)),
+                    _ => (bounds_across(triangle.map(homogeneous)), f32::INFINITY),
                 };
                 let Some([x, y]) = bounds.pixels(size) else { continue };
-                let piece = Piece { triangle: index, x, y };
+                let piece = Piece { triangle: index, nearest, x, y };
                 for strip in &mut strips[usize::from(y.0) / STRIP..=usize::from(y.1) / STRIP] {
                     strip.push(piece);
                 }

@@ -3,7 +3,7 @@
 use wide::f64x4;
 
 use crate::NO_TRIANGLE;
-use crate::setup::{Corner, Setup};
+use crate::setup::Setup;
 
 /// Rows of a strip: few enough to stay in the processor's cache.
 pub(crate) const STRIP: usize = 32;
@@ -18,6 +18,9 @@ const GLANCE: usize = 64;
 #[derive(Clone, Copy)]
 pub(crate) struct Piece {
     pub(crate) triangle: u32,
+    /// No point of the triangle has a larger inverse depth. It is here so that a hidden triangle's corners, which lie
+    /// anywhere in memory, are not fetched again.
+    pub(crate) nearest: f32,
     pub(crate) x: (u16, u16),
     pub(crate) y: (u16, u16),
 }
@@ -69,17 +72,13 @@ impl Strip {
 
     /// Whether a glance shows that what was drawn hides all of a small piece.
     #[inline]
-    pub(crate) fn hides(&self, piece: &Piece, corners: [&Corner; 3]) -> bool {
+    pub(crate) fn hides(&self, piece: &Piece) -> bool {
         let (first, last) = self.rows_of(piece);
         let columns = usize::from(piece.x.0)..usize::from(piece.x.1) + 1;
         if columns.len() * (last + 1 - first) > GLANCE {
             return false;
         }
-        let nearest = if corners.iter().all(|c| c.is_in_front()) {
-            corners[0].w.max(corners[1].w).max(corners[2].w)
-        } else {
-            f64::INFINITY
-        };
+        let nearest = f64::from(piece.nearest);
         (first..=last).all(|row| {
             let start = row * self.stride;
             self.inverse_depth[start + columns.start..start + columns.end].iter().all(|&w| w >= nearest)
