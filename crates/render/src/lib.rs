@@ -19,6 +19,7 @@
 //! assert_eq!(scene.depth(&view)[(16, 12)], 0.5);
 //! ```
 
+mod cluster;
 mod overlay;
 mod raster;
 mod ray_cast;

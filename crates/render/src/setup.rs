@@ -72,7 +72,7 @@ pub(crate) struct Setup {
 
 impl Setup {
     /// For a triangle wholly in front of the camera. `None` for one seen edge-on, or without area.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn in_front([a, b, c]: [&Corner; 3]) -> Option<Self> {
         let area = (b.x - a.x) * (c.y - a.y) - (c.x - a.x) * (b.y - a.y);
         let (b, c, area) = if area < 0.0 { (c, b, -area) } else { (b, c, area) };
@@ -126,6 +126,16 @@ impl Setup {
         Self { sides, least, inverse_depth, range }
     }
 
+    /// The functions' parts that depend on the column, for the columns from `x` on.
+    #[inline]
+    pub(crate) fn columns(&self, x: f64) -> Columns {
+        let x = f64x4::splat(x) + f64x4::new([0.0, 1.0, 2.0, 3.0]);
+        let across = |f: &Linear| f64x4::splat(f.a) * x;
+        let [a, b, c] = &self.sides;
+        Columns { sides: [across(a), across(b), across(c)], inverse_depth: across(&self.inverse_depth) }
+    }
+
+    /// The functions' parts that are constant along row `y`.
     #[inline]
     pub(crate) fn row(&self, y: f64) -> Row {
         let along = |f: &Linear| f.b * y + f.c;
@@ -133,30 +143,28 @@ impl Setup {
         Row { sides: [along(a), along(b), along(c)], inverse_depth: along(&self.inverse_depth) }
     }
 
-    /// Which of the pixel centres at columns `x` belong to the triangle, as a mask.
+    /// Which of the pixel centres belong to the triangle, as a mask.
     #[inline]
-    pub(crate) fn contains(&self, row: &Row, x: f64x4) -> f64x4 {
-        let side = |i: usize| {
-            let value = f64x4::splat(self.sides[i].a) * x + f64x4::splat(row.sides[i]);
-            value.simd_ge(f64x4::splat(self.least[i]))
-        };
+    pub(crate) fn contains(&self, columns: &Columns, row: &Row) -> f64x4 {
+        let side = |i: usize| (columns.sides[i] + f64x4::splat(row.sides[i])).simd_ge(f64x4::splat(self.least[i]));
         side(0) & side(1) & side(2)
     }
 
-    /// 1 / depth of the triangle at columns `x`.
+    /// 1 / depth of the triangle at pixel centres.
     #[inline]
-    pub(crate) fn inverse_depth(&self, row: &Row, x: f64x4) -> f64x4 {
+    pub(crate) fn inverse_depth(&self, columns: &Columns, row: &Row) -> f64x4 {
         let (low, high) = (f64x4::splat(self.range.0), f64x4::splat(self.range.1));
-        let w = f64x4::splat(self.inverse_depth.a) * x + f64x4::splat(row.inverse_depth);
+        let w = columns.inverse_depth + f64x4::splat(row.inverse_depth);
         // Written so that a number that is none, from a plane too steep for words, becomes the farthest.
         let w = w.simd_gt(low).bitselect(w, low);
         w.simd_lt(high).bitselect(w, high)
     }
 
-    /// The part of the columns `first..=last` that may belong to the triangle, a pixel too many rather than too few.
-    pub(crate) fn narrow(&self, row: &Row, first: usize, last: usize) -> (usize, usize) {
+    /// The part of the columns `first..=last` that may belong to the triangle in row `y`, a pixel too many rather than
+    /// too few.
+    pub(crate) fn narrow(&self, y: f64, first: usize, last: usize) -> (usize, usize) {
         let (mut low, mut high) = (first as f64, last as f64);
-        for (side, at) in self.sides.iter().zip(row.sides) {
+        for (side, at) in self.sides.iter().zip(self.row(y).sides) {
             let crossing = -at / side.a;
             if side.a > 0.0 {
                 low = low.max(crossing - 1.0);
@@ -168,7 +176,13 @@ impl Setup {
     }
 }
 
-/// The functions' constant parts along one row of pixels.
+/// What the functions add up from in four columns, ...
+pub(crate) struct Columns {
+    sides: [f64x4; 3],
+    inverse_depth: f64x4,
+}
+
+/// ... and along one row of pixels.
 pub(crate) struct Row {
     sides: [f64; 3],
     inverse_depth: f64,
