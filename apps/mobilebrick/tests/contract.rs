@@ -73,6 +73,23 @@ fn a_failed_mesh_leaves_nothing_behind() {
 }
 
 #[test]
+fn instructions_of_a_small_model_come_with_their_lists() {
+    let dir = tempfile::tempdir().unwrap();
+    let model = dir.path().join("tower.ldr");
+    std::fs::write(&model, "1 4 0 0 0 1 0 0 0 1 0 0 0 1 3001.dat\n1 4 0 -24 0 1 0 0 0 1 0 0 0 1 3001.dat\n").unwrap();
+    let [page, csv, xml] = ["booklet.html", "parts.csv", "parts.xml"].map(|name| dir.path().join(name));
+    let lists = ["--shopping-list", text(&csv), "--wanted-list", text(&xml)];
+    let done = document(&[&["model", "instructions", text(&model), "-o", text(&page)], &lists[..]].concat());
+    has_keys(&done, &["file", "pages", "steps", "submodels", "parts", "automatic_sections", "view_changes"]);
+    has_keys(&done, &["shopping_list", "wanted_list", "unmapped_colors", "uncertain_parts", "warnings"]);
+    assert_eq!((done["parts"].as_u64(), done["steps"].as_u64()), (Some(2), Some(2)));
+    assert!(std::fs::read_to_string(&page).unwrap().contains("<svg class=\"page\""));
+    assert!(std::fs::read_to_string(&csv).unwrap().contains("2,3001.dat"));
+    assert!(std::fs::read_to_string(&xml).unwrap().contains("<MINQTY>2</MINQTY>"));
+    failure(&["model", "instructions", text(&model), "-o", text(&dir.path().join("booklet.docx"))], 3);
+}
+
+#[test]
 fn the_stages_run_by_hand_on_the_built_in_model() {
     let dir = tempfile::tempdir().unwrap();
     let sequence = dir.path().join("seq");

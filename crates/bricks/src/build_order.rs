@@ -1,12 +1,50 @@
-//! An order in which bricks can be put in, one after the other.
+//! An order in which bricks can be put in, one after the other, and what decides it.
 
 use mb_geometry::Aabb;
 use nalgebra::Vector3;
 
-use crate::connections::Connection;
+use crate::connections::{Connection, Connections, connections_with};
+use crate::flat::Shapes;
+use crate::model::Model;
+use crate::neighbors::{Neighbors, overlap};
 
 /// Boxes that share less than this do not bar each other's way, LDraw units: studs reach 4 into the brick above.
 const SLACK_LDU: f64 = 4.5;
+
+/// Boxes that are no further apart touch, LDraw units.
+const TOUCH_LDU: f64 = 1.0;
+
+/// What decides when a brick can be put in: where the bricks are, and which holds which. For planners of building steps.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BuildSite {
+    /// The box of each brick of [`Model::instances`], LDraw units and axes (-y up); empty for a brick without surface.
+    pub boxes: Vec<Aabb>,
+    /// Which brick holds which.
+    pub connections: Connections,
+}
+
+impl Model {
+    /// What decides when each brick can be put in.
+    pub fn build_site(&self) -> BuildSite {
+        let shapes = Shapes::of(self);
+        let neighbors = Neighbors::of(self, &shapes);
+        let connections = connections_with(self, &shapes, &neighbors);
+        BuildSite { boxes: neighbors.boxes, connections }
+    }
+}
+
+impl BuildSite {
+    /// Whether the boxes of two bricks touch or overlap.
+    pub fn touch(&self, a: usize, b: usize) -> bool {
+        overlap(&self.boxes[a], &self.boxes[b]) > -TOUCH_LDU
+    }
+
+    /// Whether a brick that travels `way` (LDraw axes, unit length) reaches its place past the bricks of `placed`, as
+    /// far as boxes tell; along a way that is no axis they tell nothing, and it does.
+    pub fn is_free(&self, brick: usize, way: &Vector3<f64>, placed: &[usize]) -> bool {
+        is_free(&self.boxes, placed, brick, way)
+    }
+}
 
 /// The bricks in building order, and whether every one of them could be put in: along its studs, from a side on which
 /// no box of an earlier brick bars the way, and holding to an earlier brick unless it stands on the ground or begins a

@@ -9,6 +9,7 @@
 //! - [`Model::instances`], [`Model::occurrences`], [`Model::files`]: bricks, submodels, steps, for instructions;
 //! - [`Model::write_self_contained`]: a copy that needs no library;
 //! - [`Model::connections`] and [`Model::check`]: which brick holds which, collisions, equilibrium, a building order;
+//! - [`Model::build_site`]: what a planner of building steps has to know;
 //! - [`random_models`]: seeded models that can be built and stand; [`demo_model`]: the built-in castle;
 //! - [`external_only`]: what of a mesh can be seen from outside.
 //!
@@ -42,6 +43,7 @@ mod sketch;
 mod statics;
 mod write;
 
+pub use build_order::BuildSite;
 pub use check::{CheckOptions, CheckReport, WeakestConnection};
 pub use collisions::Collision;
 pub use connections::{Connection, Connections, Group};

@@ -20,6 +20,7 @@
 //! ```
 
 mod cluster;
+mod line_art;
 mod overlay;
 mod raster;
 mod ray_cast;
@@ -29,6 +30,7 @@ mod shade;
 mod strip;
 mod view;
 
+pub use line_art::{LineArt, LineArtOptions, Look, SharpEdge, line_art};
 pub use overlay::overlay_edges;
 pub use raster::{NO_TRIANGLE, Raster};
 pub use ray_cast::ray_cast;

@@ -1,7 +1,9 @@
 //! A camera in its place.
 
 use mb_geometry::{Camera, ImageSize, Intrinsics, Ray, Rigid3};
-use nalgebra::Point2;
+use nalgebra::{Point2, Point3, Vector3};
+
+use crate::shade::looking;
 
 /// A pinhole camera of a given image size, posed in frame `F`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -15,6 +17,29 @@ pub struct View<F> {
 }
 
 impl<F> View<F> {
+    /// A view from so far away that it keeps parallels and sizes, as drawings do: along `forward`, `up` as upright as it
+    /// can be, `middle` in the middle of the image, `metres_per_pixel` at that depth. Nothing within `reach` of the middle
+    /// is out of proportion by more than a fortieth.
+    pub fn from_afar(
+        middle: &Point3<f64>,
+        forward: &Vector3<f64>,
+        up: &Vector3<f64>,
+        size: ImageSize,
+        metres_per_pixel: f64,
+        reach: f64,
+    ) -> Self {
+        let rotation = looking(forward, up);
+        let distance = 40.0 * reach.max(1e-3);
+        let focal = distance / metres_per_pixel;
+        let (cx, cy) = (0.5 * (size.width as f64 - 1.0), 0.5 * (size.height as f64 - 1.0));
+        let translation = Vector3::new(0.0, 0.0, distance) - rotation * middle.coords;
+        Self {
+            intrinsics: Intrinsics { fx: focal, fy: focal, cx, cy },
+            size,
+            cam_from_frame: Rigid3::from_parts(rotation, translation),
+        }
+    }
+
     /// The ray through the centre of pixel (`x`, `y`), in frame `F`; its parameter is the depth.
     pub fn ray(&self, x: usize, y: usize) -> Ray {
         self.intrinsics.ray(&Point2::new(x as f64, y as f64), &self.cam_from_frame.inverse())

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 use mb_bricks::{MeshOptions, Model as BrickModel, RandomOptions, RandomProfile, random_models};
+use mb_instructions::{Form, Plan};
 use mb_job::{Error, InputError, Result};
 use serde_json::json;
 
@@ -23,6 +24,8 @@ pub enum Model {
     Random(Random),
     /// Collisions, connections, stability and a build order
     Check(Check),
+    /// Building instructions: a PDF or an HTML page, and lists for buying the parts
+    Instructions(Instructions),
     /// The official parts library
     #[command(subcommand)]
     Parts(Parts),
@@ -36,6 +39,7 @@ impl Model {
             Self::Mesh(c) => c.run(),
             Self::Random(c) => c.run(terminal),
             Self::Check(c) => c.run(),
+            Self::Instructions(c) => c.run(terminal),
             Self::Parts(c) => c.run(),
         }
     }
@@ -211,5 +215,66 @@ impl Check {
             text += &format!("{note}\n");
         }
         Outcome::new(&report, text)
+    }
+}
+
+/// Building instructions: a PDF or an HTML page, and lists for buying the parts
+#[derive(Debug, Args)]
+pub struct Instructions {
+    #[command(flatten)]
+    model: ModelArgument,
+
+    /// Output; the ending chooses the form: a PDF (A4, landscape), or one HTML page that needs no other file
+    #[arg(short, long, value_name = "FILE.pdf|FILE.html")]
+    out: PathBuf,
+
+    /// Also write the parts list as CSV
+    #[arg(long, value_name = "FILE.csv")]
+    shopping_list: Option<PathBuf>,
+
+    /// Also write the parts list as a wanted list that BrickLink imports
+    #[arg(long, value_name = "FILE.xml")]
+    wanted_list: Option<PathBuf>,
+}
+
+impl Instructions {
+    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
+        Form::of(&self.out)?;
+        let model = self.model.read()?;
+        let plan = Plan::of(&model);
+        let summary = mb_instructions::write_booklet(&model, &plan, &self.out, terminal)?;
+        let mut text = format!(
+            "wrote {}: {} pages, {} steps, {} submodels, {} parts\n",
+            self.out.display(),
+            summary.pages,
+            summary.steps,
+            summary.submodels,
+            summary.parts
+        );
+        if let Some(path) = &self.shopping_list {
+            mb_job::write_atomic(path, mb_instructions::shopping_list(&model, &plan).as_bytes())?;
+            text += &format!("wrote {}\n", path.display());
+        }
+        let mut document = serde_json::to_value(&summary)
+            .map_err(|e| Error::Failed(format!("the result is no JSON document: {e}")))?;
+        document["file"] = json!(self.out);
+        document["shopping_list"] = json!(self.shopping_list);
+        document["wanted_list"] = json!(self.wanted_list);
+        if self.shopping_list.is_some() || self.wanted_list.is_some() {
+            let notes = mb_instructions::list_notes(&model, &plan);
+            for color in &notes.unmapped_colors {
+                text += &format!("no BrickLink colour is known for {color}\n");
+            }
+            if !notes.uncertain_parts.is_empty() {
+                text += &format!("look up at BrickLink: {}\n", notes.uncertain_parts.join(", "));
+            }
+            document["unmapped_colors"] = json!(notes.unmapped_colors);
+            document["uncertain_parts"] = json!(notes.uncertain_parts);
+        }
+        if let Some(path) = &self.wanted_list {
+            mb_job::write_atomic(path, mb_instructions::wanted_list(&model, &plan).as_bytes())?;
+            text += &format!("wrote {}\n", path.display());
+        }
+        Outcome::new(&document, text)
     }
 }

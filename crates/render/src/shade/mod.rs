@@ -88,7 +88,7 @@ pub fn three_quarter_view<F>(
 }
 
 /// The rotation into a camera that looks along `forward`, its y axis as far down as it can be.
-fn looking(forward: &Vector3<f64>, up: &Vector3<f64>) -> UnitQuaternion<f64> {
+pub(crate) fn looking(forward: &Vector3<f64>, up: &Vector3<f64>) -> UnitQuaternion<f64> {
     let z = forward.normalize();
     let aside = if z.cross(up).norm() > 1e-6 { *up } else { Vector3::new(up.y, up.z, up.x) };
     let x = z.cross(&aside).normalize();

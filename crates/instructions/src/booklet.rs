@@ -1,0 +1,287 @@
+//! From a model to a booklet: plan, measure, lay out, draw, write.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder as _};
+use mb_bricks::Model;
+use mb_geometry::ImageSize;
+use mb_job::{Error, InputError, Progress, Result, Steps, write_atomic};
+use mb_render::{LineArtOptions, RgbaImage, ShadeOptions, line_art, shade};
+use rayon::prelude::*;
+use serde::Serialize;
+
+use crate::geometry::{Assembly, PartArt};
+use crate::layout::book;
+use crate::page::PictureId;
+use crate::plan::{PieceKind, Plan, section_title};
+use crate::sheet::{Sheets, Shot};
+use crate::views::{Look, frames};
+use crate::{html, pdf};
+
+/// Pixels of a millimetre on paper, in the pictures of steps (200 dots an inch) and of pieces (250).
+const STEP_PX: f64 = 200.0 / 25.4;
+const PIECE_PX: f64 = 250.0 / 25.4;
+/// Steps that are drawn at the same time: bounds the memory, whatever the thread count.
+const AT_ONCE: usize = 4;
+/// How far what was there before is faded.
+const FADE: f32 = 0.52;
+const HIGHLIGHT: [u8; 3] = [255, 96, 0];
+/// Width of lines and of the band around new pieces, millimetres.
+const LINE_MM: f64 = 0.17;
+const BAND_MM: f64 = 0.42;
+/// Jumps of depth within a part that show as lines, metres.
+const JUMP_M: f64 = 0.0007;
+/// What the pictures on the cover and the last page fit into, millimetres.
+const COVER_MM: [f64; 2] = [240.0, 138.0];
+/// Paper millimetres there for a metre of the model, at most: twice the real size.
+const LARGEST_COVER_SCALE: f64 = 2000.0;
+
+/// The form of a booklet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Form {
+    /// A PDF, A4 landscape.
+    Pdf,
+    /// One HTML page that needs no other file.
+    Html,
+}
+
+impl Form {
+    /// The form that a file's ending asks for.
+    ///
+    /// # Errors
+    /// `Error::Input` for another ending than `.pdf` and `.html`.
+    pub fn of(path: &Path) -> Result<Self> {
+        let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
+        match ending.as_str() {
+            "pdf" => Ok(Self::Pdf),
+            "html" | "htm" => Ok(Self::Html),
+            _ => Err(InputError::new(path, "the ending says neither PDF nor HTML")
+                .help("Name the output something.pdf or something.html")
+                .into()),
+        }
+    }
+}
+
+/// What a booklet holds: the document of `model instructions`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct BookletSummary {
+    /// Pages, cover included.
+    pub pages: usize,
+    /// Steps, those of submodels once.
+    pub steps: usize,
+    /// Submodels that are built on their own, the model itself not counted.
+    pub submodels: usize,
+    /// Bricks in all; what the steps add, copies of submodels included, is exactly this.
+    pub parts: usize,
+    /// Different bricks: part and colour.
+    pub distinct_parts: usize,
+    /// Sections whose steps are ours, because the author gave none.
+    pub automatic_sections: usize,
+    /// How often the view changes from one step to the next.
+    pub view_changes: usize,
+    /// Size of the file.
+    pub bytes: usize,
+    /// What the reader should know.
+    pub warnings: Vec<String>,
+}
+
+/// Writes the building instructions of a model.
+///
+/// # Errors
+/// The file cannot be written, or the person asked for a stop; nothing is left behind then.
+pub fn write_booklet(model: &Model, plan: &Plan, path: &Path, progress: &dyn Progress) -> Result<BookletSummary> {
+    let form = Form::of(path)?;
+    let (bytes, summary) = booklet(model, plan, form, progress)?;
+    write_atomic(path, &bytes)?;
+    Ok(summary)
+}
+
+/// The booklet's bytes; the same each time.
+///
+/// # Errors
+/// The person asked for a stop, or (which no model is known to cause) the PDF cannot be made.
+pub fn booklet(model: &Model, plan: &Plan, form: Form, progress: &dyn Progress) -> Result<(Vec<u8>, BookletSummary)> {
+    let art = PartArt::of(model);
+    let sheets = Sheets::measure(model, &art, plan, progress)?;
+    let title = plan.main().map_or_else(|| "Nothing to build".to_owned(), |main| section_title(model, main));
+    let title = if plan.sections.is_empty() { file_title(model) } else { title };
+    let cover = plan.main().map(|_| whole_shot(model, &art, plan, &Look::usual()));
+    let back = plan.main().map(|_| whole_shot(model, &art, plan, &Look::around(180.0)));
+    let size = |shot: &Option<Shot>| shot.as_ref().map_or([1.0; 2], Shot::size_mm);
+    let book = book(model, plan, &sheets, &title, size(&cover), size(&back));
+
+    let mut pictures: BTreeMap<PictureId, Vec<u8>> = BTreeMap::new();
+    draw_pieces(model, &art, plan, &sheets, progress, &mut pictures)?;
+    draw_steps(model, &art, plan, &sheets, progress, &mut pictures)?;
+    if let (Some(cover), Some(back), Some(main)) = (cover, back, plan.main()) {
+        let assembly = Assembly::of_section(model, &art, main);
+        for (id, shot) in [(PictureId::Cover, cover), (PictureId::Back, back)] {
+            if progress.stop_requested() {
+                return Err(Error::Stopped);
+            }
+            pictures.insert(id, png(&portrait(&assembly, &shot))?);
+        }
+    }
+    let bytes = match form {
+        Form::Pdf => pdf::pdf(&book.pages, pictures, &title)?,
+        Form::Html => html::page(&book.pages, &pictures, &title).into_bytes(),
+    };
+    let totals = plan.totals();
+    let mut warnings = model.warnings().to_vec();
+    warnings.extend(plan.warnings.iter().cloned());
+    let summary = BookletSummary {
+        pages: book.pages.len(),
+        steps: plan.order.len(),
+        submodels: plan.sections.len().saturating_sub(1),
+        parts: totals.iter().map(|(_, count)| count).sum(),
+        distinct_parts: totals.len(),
+        automatic_sections: plan.sections.iter().filter(|section| section.automatic).count(),
+        view_changes: book.view_changes,
+        bytes: bytes.len(),
+        warnings,
+    };
+    Ok((bytes, summary))
+}
+
+fn file_title(model: &Model) -> String {
+    model.path().file_stem().map_or_else(|| "Model".to_owned(), |stem| stem.to_string_lossy().into_owned())
+}
+
+/// The whole model, as large as the cover allows.
+fn whole_shot(model: &Model, art: &PartArt, plan: &Plan, look: &Look) -> Shot {
+    let frame = plan.main().map(|main| {
+        let assembly = Assembly::of_section(model, art, main);
+        frames(&assembly, look)[assembly.bricks()]
+    });
+    let frame = frame.expect("asked for only where there is something to build");
+    // Room for the shadow on the ground.
+    let size_m = [frame.size_m[0] * 1.1, frame.size_m[1] * 1.06];
+    let frame = crate::views::Frame { size_m, ..frame };
+    let scale = (0..2).map(|i| COVER_MM[i] / frame.size_m[i].max(1e-9)).fold(LARGEST_COVER_SCALE, f64::min);
+    Shot { look: *look, frame, scale }
+}
+
+fn draw_pieces(
+    model: &Model,
+    art: &PartArt,
+    plan: &Plan,
+    sheets: &Sheets,
+    progress: &dyn Progress,
+    pictures: &mut BTreeMap<PictureId, Vec<u8>>,
+) -> Result<()> {
+    let counter = Steps::new(progress, "drawing parts", sheets.pieces.len());
+    let pieces: Vec<(&PieceKind, &Shot)> = sheets.pieces.iter().collect();
+    for chunk in pieces.chunks(8 * AT_ONCE) {
+        let drawn: Vec<Result<(PictureId, Vec<u8>)>> = chunk
+            .par_iter()
+            .map(|(kind, shot)| {
+                let assembly = match **kind {
+                    PieceKind::Part(part, color) => Assembly::of_part(model, art, part, color),
+                    PieceKind::Submodel(section) => Assembly::of_section(model, art, &plan.sections[section]),
+                };
+                let bricks = assembly.bricks();
+                let picture = draw(&assembly, shot, bricks, bricks, 0.0, PIECE_PX);
+                counter.step()?;
+                Ok((PictureId::Piece(**kind), png(&picture)?))
+            })
+            .collect();
+        for one in drawn {
+            let (id, bytes) = one?;
+            pictures.insert(id, bytes);
+        }
+    }
+    Ok(())
+}
+
+fn draw_steps(
+    model: &Model,
+    art: &PartArt,
+    plan: &Plan,
+    sheets: &Sheets,
+    progress: &dyn Progress,
+    pictures: &mut BTreeMap<PictureId, Vec<u8>>,
+) -> Result<()> {
+    let counter = Steps::new(progress, "drawing steps", plan.order.len());
+    for (index, section) in plan.sections.iter().enumerate() {
+        let assembly = Assembly::of_section(model, art, section);
+        let mut ends = vec![0];
+        for step in &section.steps {
+            ends.push(ends[ends.len() - 1] + step.bricks().count());
+        }
+        let steps: Vec<usize> = (0..section.steps.len()).collect();
+        for chunk in steps.chunks(AT_ONCE) {
+            let drawn: Vec<Result<(PictureId, Vec<u8>)>> = chunk
+                .par_iter()
+                .map(|&step| {
+                    let shot = &sheets.steps[index][step];
+                    let picture = draw(&assembly, shot, ends[step + 1], ends[step], FADE, STEP_PX);
+                    counter.step()?;
+                    Ok((PictureId::Step(index, step), png(&picture)?))
+                })
+                .collect();
+            for one in drawn {
+                let (id, bytes) = one?;
+                pictures.insert(id, bytes);
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Draws the first `bricks` bricks; those before `new` are faded, the others have a band around them, unless `new` is 0 or
+/// all of them.
+fn draw(assembly: &Assembly, shot: &Shot, bricks: usize, new: usize, fade: f32, px_per_mm: f64) -> RgbaImage {
+    let highlight = new > 0 && new < bricks;
+    let looks = assembly.looks(bricks, if highlight { new } else { 0 }, fade, highlight);
+    let mesh = assembly.mesh_of(bricks);
+    let view = shot.look.view(&shot.frame, pixels(shot, px_per_mm), 1.0 / (shot.scale * px_per_mm));
+    let options = LineArtOptions {
+        samples: 3,
+        line_px: LINE_MM * px_per_mm,
+        highlight_px: BAND_MM * px_per_mm,
+        highlight: HIGHLIGHT,
+        jump: JUMP_M.max(2.5 / (shot.scale * px_per_mm)),
+    };
+    line_art(&assembly.art(bricks, &mesh, &looks), &view, &options)
+}
+
+fn pixels(shot: &Shot, px_per_mm: f64) -> ImageSize {
+    let [w, h] = shot.size_mm().map(|v| (v * px_per_mm).round().clamp(1.0, 8000.0) as usize);
+    ImageSize::new(w, h)
+}
+
+/// The model as on the box: lines and colours of the drawings, in daylight, on a ground that takes its shadow.
+fn portrait(assembly: &Assembly, shot: &Shot) -> RgbaImage {
+    let bricks = assembly.bricks();
+    let drawing = draw(assembly, shot, bricks, bricks, 0.0, STEP_PX);
+    let mut white = assembly.mesh_of(bricks);
+    white.triangle_colors = None;
+    let view = shot.look.view(&shot.frame, pixels(shot, STEP_PX), 1.0 / (shot.scale * STEP_PX));
+    let light = shade(&white, &view, &ShadeOptions { samples: 1, color: [255; 3], ..ShadeOptions::default() });
+    let mut at = 0;
+    drawing.map(|&[r, g, b, a]| {
+        let [l, _, _, shadow] = light.data()[at];
+        at += 1;
+        let lit = f32::from(a) / 255.0;
+        // Even shading is in the drawing already: daylight only darkens what is hidden from it.
+        let dim = if shadow == 0 { 1.0 } else { (0.42 + 0.66 * f32::from(l) / 255.0).min(1.06) };
+        let ground = f32::from(shadow) * (1.0 - lit) / 255.0;
+        let opacity = lit + ground * (1.0 - lit);
+        if opacity <= 0.0 {
+            return [0; 4];
+        }
+        let mix = |v: u8| (f32::from(v) * dim * lit / opacity).round().clamp(0.0, 255.0) as u8;
+        [mix(r), mix(g), mix(b), (opacity * 255.0).round() as u8]
+    })
+}
+
+fn png(picture: &RgbaImage) -> Result<Vec<u8>> {
+    let mut bytes = vec![];
+    let size = picture.size();
+    PngEncoder::new_with_quality(&mut bytes, CompressionType::Default, FilterType::Adaptive)
+        .write_image(picture.data().as_flattened(), size.width as u32, size.height as u32, ExtendedColorType::Rgba8)
+        .map_err(|e| Error::Failed(format!("a picture cannot be encoded: {e}")))?;
+    Ok(bytes)
+}
