@@ -87,6 +87,7 @@ fn instructions_of_a_small_model_come_with_their_lists() {
     assert!(std::fs::read_to_string(&csv).unwrap().contains("2,3001.dat"));
     assert!(std::fs::read_to_string(&xml).unwrap().contains("<MINQTY>2</MINQTY>"));
     failure(&["model", "instructions", text(&model), "-o", text(&dir.path().join("booklet.docx"))], 3);
+    failure(&["model", "instructions", text(&model), "-o", text(&page), "--shopping-list", text(&page)], 3);
 }
 
 #[test]

@@ -105,8 +105,7 @@ pub fn write_booklet(model: &Model, plan: &Plan, path: &Path, progress: &dyn Pro
 pub fn booklet(model: &Model, plan: &Plan, form: Form, progress: &dyn Progress) -> Result<(Vec<u8>, BookletSummary)> {
     let art = PartArt::of(model);
     let sheets = Sheets::measure(model, &art, plan, progress)?;
-    let title = plan.main().map_or_else(|| "Nothing to build".to_owned(), |main| section_title(model, main));
-    let title = if plan.sections.is_empty() { file_title(model) } else { title };
+    let title = title(model, plan);
     let cover = plan.main().map(|_| whole_shot(model, &art, plan, &Look::usual()));
     let back = plan.main().map(|_| whole_shot(model, &art, plan, &Look::around(180.0)));
     let size = |shot: &Option<Shot>| shot.as_ref().map_or([1.0; 2], Shot::size_mm);
@@ -145,8 +144,15 @@ pub fn booklet(model: &Model, plan: &Plan, form: Form, progress: &dyn Progress) 
     Ok((bytes, summary))
 }
 
-fn file_title(model: &Model) -> String {
-    model.path().file_stem().map_or_else(|| "Model".to_owned(), |stem| stem.to_string_lossy().into_owned())
+/// What stands on the cover: what the author calls the model, or the file's name where that says nothing.
+fn title(model: &Model, plan: &Plan) -> String {
+    const SAY_NOTHING: [&str; 6] = ["", "main", "main model", "model", "untitled", "untitled model"];
+    let stated = plan.main().map(|main| section_title(model, main)).unwrap_or_default();
+    if SAY_NOTHING.contains(&stated.to_lowercase().as_str()) {
+        model.path().file_stem().map_or_else(|| "Model".to_owned(), |stem| stem.to_string_lossy().into_owned())
+    } else {
+        stated
+    }
 }
 
 /// The whole model, as large as the cover allows.

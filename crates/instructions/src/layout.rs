@@ -1,9 +1,9 @@
 //! Where everything stands on the pages.
 
-use std::collections::BTreeMap;
-
 use mb_bricks::{ColorCode, Model};
 
+use crate::call_out::{CallOut, Entry, Fit, call_out, fits};
+use crate::colors::similar_colors;
 use crate::page::{Align, PAGE_MM, Page, PictureId, Rect, Rgb};
 use crate::plan::{PieceKind, Plan, section_title};
 use crate::sheet::{Sheets, Shot};
@@ -18,18 +18,25 @@ const CALL_OUT_LINE: Rgb = [150, 188, 220];
 const SUBMODEL: Rgb = [255, 247, 226];
 const SUBMODEL_LINE: Rgb = [232, 196, 112];
 const ACCENT: Rgb = [0, 98, 168];
+const ALARM: Rgb = [190, 30, 20];
 
 const MARGIN: f64 = 8.0;
 const FOOT: f64 = 10.0;
-const GAP: f64 = 3.0;
+pub(crate) const GAP: f64 = 3.0;
 /// Space inside a cell.
-const PAD: f64 = 3.0;
+pub(crate) const PAD: f64 = 3.0;
+/// Height of a step's number, with the space around it.
+pub(crate) const NUMBER: f64 = 11.0;
 /// The band over the first step of a submodel.
 const BAND: f64 = 9.0;
-/// Two colours closer than this are named where they are used (CIE 1976 difference; 2.3 is just noticeable).
-const SIMILAR_COLORS: f64 = 26.0;
-/// Columns and rows of steps on a page, the fullest first.
-const GRIDS: [[usize; 2]; 5] = [[3, 2], [2, 2], [3, 1], [2, 1], [1, 1]];
+/// Height of the line that says how often a submodel is built.
+const TIMES: f64 = 7.0;
+/// Most columns, rows and steps of a page.
+const MAX_COLUMNS: usize = 3;
+const MAX_ROWS: usize = 3;
+const MAX_STEPS: usize = 6;
+/// Rows are no lower than this, millimetres.
+const ROW_MM: f64 = 50.0;
 
 /// The pages and the pictures on them.
 pub(crate) struct Book {
@@ -60,38 +67,31 @@ struct Layout<'a> {
     view_changes: usize,
 }
 
-/// A piece in a call-out.
-struct Entry {
-    id: PictureId,
-    size: [f64; 2],
-    count: String,
-    color: Option<String>,
-    submodel: bool,
-}
-
-impl Entry {
-    fn width(&self) -> f64 {
-        let name = self.color.as_ref().map_or(0.0, |name| Weight::Regular.width(name, 2.3));
-        self.size[0].max(Weight::Bold.width(&self.count, 3.8)).max(name)
-    }
-
-    fn height(&self) -> f64 {
-        self.size[1] + 4.6 + if self.color.is_some() { 2.8 } else { 0.0 }
-    }
-}
-
-/// A call-out: its size and where its entries stand in it.
-struct CallOut {
-    size: [f64; 2],
-    places: Vec<[f64; 2]>,
-}
-
 /// How a step fills its cell.
 struct Arrangement {
     call_out: CallOut,
     shrink: f64,
     picture: Rect,
     number: [f64; 2],
+}
+
+/// A row of a page.
+#[derive(Debug, Clone, Copy)]
+struct Row {
+    columns: usize,
+    /// What its steps need.
+    height: f64,
+}
+
+/// Pages with more steps are better, then rows of equal length, then fewer rows.
+fn rank(rows: &[Row]) -> (usize, std::cmp::Reverse<usize>, std::cmp::Reverse<usize>) {
+    let columns = || rows.iter().map(|row| row.columns);
+    let uneven = columns().max().unwrap_or(0) - columns().min().unwrap_or(0);
+    (columns().sum(), std::cmp::Reverse(uneven), std::cmp::Reverse(rows.len()))
+}
+
+fn column_width(area: &Rect, columns: usize) -> f64 {
+    (area.w - GAP * (columns - 1) as f64) / columns as f64
 }
 
 impl Layout<'_> {
@@ -115,6 +115,12 @@ impl Layout<'_> {
         let after = 20.0 + Weight::Bold.width(&facts, 7.5) + 5.0;
         let more = format!("{steps} {}", if steps == 1 { "step" } else { "steps" });
         page.text([after, PAGE_MM[1] - 12.0], 5.0, Weight::Regular, GREY, Align::Left, more);
+        let missing = self.model.missing().len();
+        if missing > 0 {
+            let are = if missing == 1 { "1 part is".to_owned() } else { format!("{missing} parts are") };
+            let words = format!("Incomplete: {are} missing from the parts library and left out");
+            page.text([PAGE_MM[0] - 12.0, PAGE_MM[1] - 12.0], 5.0, Weight::Bold, ALARM, Align::Right, words);
+        }
         self.pages.push(page);
     }
 
@@ -198,38 +204,49 @@ impl Layout<'_> {
         let mut at = 0;
         while at < self.plan.order.len() {
             let left = &self.plan.order[at..];
-            let cells = |[columns, rows]: [usize; 2]| {
-                let (w, h) = (
-                    (area.w - GAP * (columns - 1) as f64) / columns as f64,
-                    (area.h - GAP * (rows - 1) as f64) / rows as f64,
-                );
-                (0..columns * rows).map(move |i| {
-                    let (column, row) = ((i % columns) as f64, (i / columns) as f64);
-                    Rect::new(area.x + column * (w + GAP), area.y + row * (h + GAP), w, h)
-                })
-            };
-            let fits = |grid: [usize; 2]| {
-                let arranged: Option<Vec<(Rect, Arrangement)>> = left
-                    .iter()
-                    .zip(cells(grid))
-                    .map(|(&(section, step), cell)| Some((cell, self.arrange(section, step, &cell, false)?)))
-                    .collect();
-                // A grid that the last steps leave half empty is the wrong one.
-                arranged.filter(|a| a.len() * 2 > grid[0] * grid[1] || grid == [1, 1])
-            };
-            let arranged = GRIDS.into_iter().find_map(fits).unwrap_or_else(|| {
-                let (section, step) = left[0];
-                self.arrange(section, step, &area, true).map(|a| (area, a)).into_iter().collect()
-            });
             let mut page = Page { title: format!("Page {}", self.pages.len() + 1), ..Page::default() };
-            let count = arranged.len().max(1);
-            for (index, (cell, arrangement)) in arranged.into_iter().enumerate() {
-                let (section, step) = self.plan.order[at + index];
-                self.step(&mut page, section, step, &cell, &arrangement);
+            let rows = self.rows(left, &area);
+            let count: usize = rows.iter().map(|row| row.columns).sum();
+            // What is free is shared among the rows.
+            let heights: f64 = rows.iter().map(|row| row.height).sum();
+            let spare = (area.h - GAP * (rows.len() - 1) as f64 - heights) / rows.len() as f64;
+            let (mut y, mut next) = (area.y, left.iter().copied());
+            for row in rows {
+                let (w, h) = (column_width(&area, row.columns), row.height + spare);
+                for (column, (section, step)) in next.by_ref().take(row.columns).enumerate() {
+                    let cell = Rect::new(area.x + column as f64 * (w + GAP), y, w, h);
+                    let arrangement = self.arrange(section, step, &cell);
+                    self.step(&mut page, section, step, &cell, &arrangement);
+                }
+                y += h + GAP;
             }
             at += count;
             self.pages.push(page);
         }
+    }
+
+    /// The rows of the next page: those that hold the most steps; of these the most even ones.
+    fn rows(&self, left: &[(usize, usize)], area: &Rect) -> Vec<Row> {
+        let row = |from: usize, columns: usize| {
+            let w = column_width(area, columns);
+            let heights = left[from..from + columns].iter().map(|&(section, step)| self.least_height(section, step, w));
+            let height = heights.reduce(|sum, height| Some(sum?.max(height?))).flatten()?.max(ROW_MM);
+            Some(Row { columns, height })
+        };
+        let mut best: Vec<Row> = vec![Row { columns: 1, height: area.h }];
+        let mut open: Vec<Vec<Row>> = vec![vec![]];
+        while let Some(rows) = open.pop() {
+            let from: usize = rows.iter().map(|row| row.columns).sum();
+            let used: f64 = rows.iter().map(|row| row.height + GAP).sum();
+            if rank(&rows) > rank(&best) {
+                best.clone_from(&rows);
+            }
+            let most =
+                if rows.len() < MAX_ROWS { (MAX_STEPS - from).min(left.len() - from).min(MAX_COLUMNS) } else { 0 };
+            let longer = (1..=most).filter_map(|columns| row(from, columns)).filter(|row| used + row.height <= area.h);
+            open.extend(longer.map(|row| rows.iter().copied().chain([row]).collect::<Vec<_>>()));
+        }
+        best
     }
 
     /// Whether this is a submodel, and so stands on coloured ground.
@@ -237,55 +254,56 @@ impl Layout<'_> {
         section + 1 != self.plan.sections.len()
     }
 
-    /// How a step fits into a cell; `None` where it does not. With `force` the call-out shrinks until it does.
-    fn arrange(&self, section: usize, step: usize, cell: &Rect, force: bool) -> Option<Arrangement> {
+    /// The least height of a cell of width `w` that holds a step; `None` where none does.
+    fn least_height(&self, section: usize, step: usize, w: f64) -> Option<f64> {
+        let [top, bottom] = self.margins(section, step);
+        let picture = self.sheets.steps[section][step].size_mm();
+        let ways = fits(&self.entries(section, step), picture, w - 2.0 * PAD);
+        ways.into_iter().map(|fit| fit.height + top + bottom).reduce(f64::min)
+    }
+
+    /// What of a cell is not free, above and below: a submodel has a band over its first step, and under its last one
+    /// how often it is built.
+    fn margins(&self, section: usize, step: usize) -> [f64; 2] {
+        let band = if self.is_submodel(section) && step == 0 { BAND } else { 0.0 };
+        let times = if self.ends_copies(section, step) { TIMES } else { 0.0 };
+        [PAD + band, PAD + times]
+    }
+
+    /// Whether this is the last step of something that is built more than once.
+    fn ends_copies(&self, section: usize, step: usize) -> bool {
+        let of_section = &self.plan.sections[section];
+        of_section.copies > 1 && step + 1 == of_section.steps.len()
+    }
+
+    /// How a step stands in a cell. Where it does not fit, its call-out shrinks until it does.
+    fn arrange(&self, section: usize, step: usize, cell: &Rect) -> Arrangement {
         let [w, h] = self.sheets.steps[section][step].size_mm();
-        let mut inner = cell.inset(PAD);
-        if self.is_submodel(section) && step == 0 {
-            inner.y += BAND;
-            inner.h -= BAND;
-        }
-        let number_h = 11.0;
+        let [above, below] = self.margins(section, step);
+        let inner = Rect::new(cell.x + PAD, cell.y + above, cell.w - 2.0 * PAD, cell.h - above - below);
         let mut shrink = 1.0;
         loop {
-            let entries: Vec<Entry> = self
-                .entries(section, step)
-                .into_iter()
-                .map(|mut e| {
-                    e.size = e.size.map(|v| v * shrink);
-                    e
-                })
-                .collect();
-            // The call-out above the picture, or beside it.
-            let above = call_out(&entries, inner.w);
-            let room = inner.h - above.size[1] - GAP;
-            // The corner of a slanted picture leaves room for the number.
-            let clear = if w + 2.0 * 16.0 <= inner.w { 0.0 } else { 0.45 * number_h };
-            if w <= inner.w && h + clear <= room && above.size[0] <= inner.w {
-                let y = inner.y + above.size[1] + GAP + clear + 0.5 * (room - clear - h);
-                let picture = Rect::new(inner.x + 0.5 * (inner.w - w), y, w, h);
-                let number = [inner.x, inner.y + above.size[1] + number_h];
-                return Some(Arrangement { call_out: above, shrink, picture, number });
-            }
-            let widest = entries.iter().map(Entry::width).fold(0.0, f64::max) + 2.0 * PAD;
-            for columns in 1..=2 {
-                let beside = call_out(&entries, (widest * f64::from(columns)).max(26.0));
-                let room = inner.w - beside.size[0] - GAP;
-                if w <= room && h <= inner.h && beside.size[1] + number_h <= inner.h {
-                    let x = inner.x + beside.size[0] + GAP + 0.5 * (room - w);
-                    let picture = Rect::new(x, inner.y + 0.5 * (inner.h - h), w, h);
-                    let number = [inner.x, inner.y + beside.size[1] + number_h];
-                    return Some(Arrangement { call_out: beside, shrink, picture, number });
-                }
-            }
-            if !force {
-                return None;
+            let mut entries = self.entries(section, step);
+            entries.iter_mut().for_each(|entry| entry.size = entry.size.map(|v| v * shrink));
+            let fitting = fits(&entries, [w, h], inner.w).into_iter().find(|fit| fit.height <= inner.h + 1e-6);
+            if let Some(Fit { call_out, beside, clear, .. }) = fitting {
+                let [left, top] =
+                    if beside { [call_out.size[0] + GAP, 0.0] } else { [0.0, call_out.size[1] + GAP + clear] };
+                let picture = Rect::new(
+                    inner.x + left + 0.5 * (inner.w - left - w),
+                    inner.y + top + 0.5 * (inner.h - top - h),
+                    w,
+                    h,
+                );
+                let number = [inner.x, inner.y + call_out.size[1] + NUMBER];
+                return Arrangement { call_out, shrink, picture, number };
             }
             if shrink < 0.2 {
                 // Nothing fits: the picture keeps its scale and may run under the call-out.
+                let call_out = call_out(&entries, inner.w);
                 let picture = Rect::new(inner.right() - w, inner.bottom() - h, w, h);
-                let number = [inner.x, inner.y + above.size[1] + number_h];
-                return Some(Arrangement { call_out: above, shrink, picture, number });
+                let number = [inner.x, inner.y + call_out.size[1] + NUMBER];
+                return Arrangement { call_out, shrink, picture, number };
             }
             shrink *= 0.8;
         }
@@ -324,8 +342,7 @@ impl Layout<'_> {
         page.text(arrangement.number, size, Weight::Bold, INK, Align::Left, number);
 
         let call_out = &arrangement.call_out;
-        let inner_y = if submodel && step == 0 { cell.y + BAND + PAD } else { cell.y + PAD };
-        let rect = Rect::new(cell.x + PAD, inner_y, call_out.size[0], call_out.size[1]);
+        let rect = Rect::new(cell.x + PAD, cell.y + self.margins(section, step)[0], call_out.size[0], call_out.size[1]);
         page.elements.push(crate::page::Element::Box {
             rect,
             radius: 1.8,
@@ -361,7 +378,7 @@ impl Layout<'_> {
             let [x, y] = arrangement.number;
             signs::turn(page, [x + number_width + 8.0, y - 3.2], turn);
         }
-        if submodel && of_section.copies > 1 && step + 1 == of_section.steps.len() {
+        if self.ends_copies(section, step) {
             let times = format!("{}x", of_section.copies);
             page.text([cell.right() - PAD, cell.bottom() - PAD], 8.0, Weight::Bold, INK, Align::Right, times);
         }
@@ -405,72 +422,6 @@ impl Layout<'_> {
     }
 }
 
-/// Entries in rows no wider than `width`.
-fn call_out(entries: &[Entry], width: f64) -> CallOut {
-    const BETWEEN: f64 = 3.5;
-    let limit = width - 2.0 * PAD;
-    let mut rows: Vec<Vec<usize>> = vec![];
-    let mut used = f64::INFINITY;
-    for (index, entry) in entries.iter().enumerate() {
-        if used + BETWEEN + entry.width() > limit {
-            rows.push(vec![]);
-            used = -BETWEEN;
-        }
-        used += BETWEEN + entry.width();
-        if let Some(row) = rows.last_mut() {
-            row.push(index);
-        }
-    }
-    let mut places = vec![[0.0; 2]; entries.len()];
-    let (mut y, mut widest) = (PAD, 0.0_f64);
-    for row in &rows {
-        let height = row.iter().map(|&i| entries[i].height()).fold(0.0, f64::max);
-        let mut x = PAD;
-        for &i in row {
-            // On a common base line.
-            places[i] = [x, y + height - entries[i].height()];
-            x += entries[i].width() + BETWEEN;
-        }
-        widest = widest.max(x - BETWEEN + PAD);
-        y += height + 2.0;
-    }
-    CallOut { size: [widest, y - 2.0 + PAD - 1.5], places }
-}
-
-/// The colours of a plan that look like another one of it.
-fn similar_colors(model: &Model, plan: &Plan) -> Vec<ColorCode> {
-    let mut used: Vec<ColorCode> = plan.totals().iter().map(|((_, color), _)| *color).collect();
-    used.sort_unstable();
-    used.dedup();
-    let looks: BTreeMap<ColorCode, ([f64; 3], u8)> = used
-        .iter()
-        .map(|&code| {
-            let look = model.colors().look(code);
-            (code, (lab(look.rgb), look.alpha))
-        })
-        .collect();
-    let similar = |a: &ColorCode, b: &ColorCode| {
-        let ((x, x_alpha), (y, y_alpha)) = (looks[a], looks[b]);
-        let difference = (0..3).map(|i| (x[i] - y[i]).powi(2)).sum::<f64>().sqrt();
-        a != b && (x_alpha < 255) == (y_alpha < 255) && difference < SIMILAR_COLORS
-    };
-    used.iter().filter(|a| used.iter().any(|b| similar(a, b))).copied().collect()
-}
-
-/// CIE L*a*b* of an sRGB colour under D65.
-fn lab(rgb: Rgb) -> [f64; 3] {
-    let linear = rgb.map(|v| {
-        let v = f64::from(v) / 255.0;
-        if v <= 0.040_45 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
-    });
-    let dot = |row: [f64; 3]| row.iter().zip(linear).map(|(a, b)| a * b).sum::<f64>();
-    let x = dot([0.4124, 0.3576, 0.1805]) / 0.950_47;
-    let y = dot([0.2126, 0.7152, 0.0722]);
-    let z = dot([0.0193, 0.1192, 0.9505]) / 1.088_83;
-    let f = |t: f64| if t > 0.008_856 { t.cbrt() } else { 7.787 * t + 16.0 / 116.0 };
-    [116.0 * f(y) - 16.0, 500.0 * (f(x) - f(y)), 200.0 * (f(y) - f(z))]
-}
-
 /// Sorts `2 x 10` after `2 x 4`: numbers by value.
 fn natural(text: &str) -> Vec<(u64, String)> {
     let mut key = vec![];
@@ -499,32 +450,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_sort_by_value_and_similar_greys_are_named() {
+    fn numbers_sort_by_value() {
         let mut names = vec!["Brick  2 x 10", "Brick  2 x  4", "Arch  1 x  3"];
         names.sort_by_key(|name| natural(name));
         assert_eq!(names, ["Arch  1 x  3", "Brick  2 x  4", "Brick  2 x 10"]);
-        let text = "1 71 0 0 0 1 0 0 0 1 0 0 0 1 3005.dat\n1 7 40 0 0 1 0 0 0 1 0 0 0 1 3005.dat\n\
-                    1 4 80 0 0 1 0 0 0 1 0 0 0 1 3005.dat\n";
-        let model = Model::from_text(text, "greys.ldr", None).unwrap();
-        assert_eq!(similar_colors(&model, &Plan::of(&model)), [ColorCode(7), ColorCode(71)]);
     }
 
     #[test]
-    fn a_call_out_breaks_into_rows_and_contains_its_entries() {
-        let entry = |w: f64| Entry {
-            id: PictureId::Cover,
-            size: [w, 10.0],
-            count: "2x".to_owned(),
-            color: None,
-            submodel: false,
-        };
-        let entries: Vec<Entry> = [20.0, 30.0, 25.0].into_iter().map(entry).collect();
-        for width in [40.0, 70.0, 200.0] {
-            let call_out = call_out(&entries, width);
-            assert!(call_out.size[0] <= width, "{width}");
-            for (entry, [x, y]) in entries.iter().zip(&call_out.places) {
-                assert!(x + entry.width() <= call_out.size[0] && y + entry.height() <= call_out.size[1] + 0.1);
-            }
-        }
+    fn full_pages_of_even_rows_are_best() {
+        let rows = |columns: &[usize]| columns.iter().map(|&columns| Row { columns, height: 60.0 }).collect::<Vec<_>>();
+        let best_first = [rows(&[3, 3]), rows(&[1, 2, 3]), rows(&[2, 2]), rows(&[1, 3]), rows(&[3]), rows(&[1, 2])];
+        assert!(best_first.windows(2).all(|pair| rank(&pair[0]) > rank(&pair[1])));
     }
 }

@@ -19,6 +19,8 @@
 mod automatic;
 mod booklet;
 mod bricklink;
+mod call_out;
+mod colors;
 mod geometry;
 mod html;
 mod layout;

@@ -20,11 +20,6 @@ impl Rect {
         Self { x, y, w, h }
     }
 
-    /// Smaller by `margin` on every side.
-    pub fn inset(&self, margin: f64) -> Self {
-        Self::new(self.x + margin, self.y + margin, self.w - 2.0 * margin, self.h - 2.0 * margin)
-    }
-
     pub fn right(&self) -> f64 {
         self.x + self.w
     }

@@ -19,6 +19,12 @@ const WELL_SEEN: f64 = 0.22;
 const HIDDEN: f64 = 0.45;
 /// What a change of view costs, in hidden pieces.
 const CHANGE: f64 = 0.35;
+/// Steps that a view is chosen for, and what hidden pieces of the later ones count: a model that turns back and forth is
+/// worse than one that stays turned for a while.
+const AHEAD: usize = 4;
+const LATER: f64 = 0.3;
+/// What it costs besides to turn the model upside down.
+const OVER: f64 = 0.5;
 
 /// The object frame of a section; only pictures know it.
 pub(crate) enum Shown {}
@@ -158,15 +164,16 @@ pub(crate) fn choose(section: &Section, assembly: &Assembly) -> Vec<Look> {
             looks.push(Look::of_author(view));
             continue;
         }
-        let next = (index + 1).min(section.steps.len() - 1);
-        if current != 0 && !trial.hides(index, 0) && !trial.hides(next, 0) {
+        let soon = index..(index + AHEAD).min(section.steps.len());
+        if current != 0 && !soon.clone().any(|step| trial.hides(step, 0)) {
             current = 0;
         }
         if trial.hides(index, current) {
             let cost = |trial: &mut Trial, view: usize| {
                 // Upside down is the last resort.
                 let change = if view == current { 0.0 } else { CHANGE };
-                trial.cost(index, view) + change + if view >= 4 { 0.1 } else { 0.0 }
+                let later: f64 = (index + 1..soon.end).map(|step| trial.cost(step, view)).sum();
+                trial.cost(index, view) + LATER * later + change + if view >= 4 { OVER } else { 0.0 }
             };
             let costs: Vec<f64> = (0..trial.candidates.len()).map(|view| cost(&mut trial, view)).collect();
             current = (0..costs.len()).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(current);
@@ -192,8 +199,12 @@ impl Trial<'_> {
         self.seen(step, view).iter().any(|&seen| seen < HIDDEN)
     }
 
+    /// Hidden pieces; half as bad where an equal one is well seen, as with the wheels on the far side of a car.
     fn cost(&mut self, step: usize, view: usize) -> f64 {
-        self.seen(step, view).iter().map(|seen| 1.0 - seen).sum()
+        let pieces = &self.section.steps[step].pieces;
+        let seen = self.seen(step, view);
+        let shown = |kind| pieces.iter().zip(seen).any(|(other, &seen)| other.kind == kind && seen >= 1.0);
+        pieces.iter().zip(seen).map(|(piece, seen)| (1.0 - seen) * if shown(piece.kind) { 0.5 } else { 1.0 }).sum()
     }
 
     fn seen(&mut self, step: usize, view: usize) -> &[f64] {

@@ -75,7 +75,12 @@ fn models_without_parts_with_missing_parts_and_with_strange_colours_give_booklet
         let (bytes, summary) = bytes("3 4 0 0 0 20 0 0 0 0 20\n", form);
         assert!(!bytes.is_empty() && summary.pages >= 2);
     }
-    let (_, summary) = bytes(strange, Form::Pdf);
+    let (page, summary) = bytes(strange, Form::Html);
+    assert!(str::from_utf8(&page).unwrap().contains("Incomplete: 1 part is missing"));
+    assert!(
+        str::from_utf8(&page).unwrap().contains("<title>tower</title>"),
+        "the file's name for want of a better one"
+    );
     assert!(summary.warnings.iter().any(|w| w.contains("nosuchpart.dat")));
     let model = model(strange);
     let notes = list_notes(&model, &Plan::of(&model));

@@ -240,8 +240,22 @@ pub struct Instructions {
 impl Instructions {
     fn run(&self, terminal: &Terminal) -> Result<Outcome> {
         Form::of(&self.out)?;
+        let outputs: Vec<&PathBuf> =
+            [Some(&self.out), self.shopping_list.as_ref(), self.wanted_list.as_ref()].into_iter().flatten().collect();
+        if let Some(twice) = (1..outputs.len()).find(|&i| outputs[..i].contains(&outputs[i])) {
+            return Err(InputError::new(outputs[twice], "two outputs have this name")
+                .help("Give the booklet and each list a file of its own")
+                .into());
+        }
         let model = self.model.read()?;
         let plan = Plan::of(&model);
+        // The lists take no time: what keeps them from being written is known before the drawing begins.
+        if let Some(path) = &self.shopping_list {
+            mb_job::write_atomic(path, mb_instructions::shopping_list(&model, &plan).as_bytes())?;
+        }
+        if let Some(path) = &self.wanted_list {
+            mb_job::write_atomic(path, mb_instructions::wanted_list(&model, &plan).as_bytes())?;
+        }
         let summary = mb_instructions::write_booklet(&model, &plan, &self.out, terminal)?;
         let mut text = format!(
             "wrote {}: {} pages, {} steps, {} submodels, {} parts\n",
@@ -251,8 +265,7 @@ impl Instructions {
             summary.submodels,
             summary.parts
         );
-        if let Some(path) = &self.shopping_list {
-            mb_job::write_atomic(path, mb_instructions::shopping_list(&model, &plan).as_bytes())?;
+        for path in &outputs[1..] {
             text += &format!("wrote {}\n", path.display());
         }
         let mut document = serde_json::to_value(&summary)
@@ -270,10 +283,6 @@ impl Instructions {
             }
             document["unmapped_colors"] = json!(notes.unmapped_colors);
             document["uncertain_parts"] = json!(notes.uncertain_parts);
-        }
-        if let Some(path) = &self.wanted_list {
-            mb_job::write_atomic(path, mb_instructions::wanted_list(&model, &plan).as_bytes())?;
-            text += &format!("wrote {}\n", path.display());
         }
         Outcome::new(&document, text)
     }
