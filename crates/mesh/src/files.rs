@@ -138,6 +138,12 @@ impl<'a> Builder<'a> {
         }
     }
 
+    /// Makes room for as many vertices and triangles as the file will bring, if that is known.
+    pub(crate) fn reserve(&mut self, vertices: usize, triangles: usize) {
+        self.vertices.reserve_exact(vertices);
+        self.triangles.reserve_exact(triangles);
+    }
+
     /// Vertices so far.
     pub(crate) fn vertex_count(&self) -> usize {
         self.vertices.len()

@@ -15,7 +15,7 @@ mod stl;
 mod surface;
 mod triangle_mesh;
 
-pub use bvh::{Bvh, Closest, Hit, closest_point_on_triangle};
+pub use bvh::{Bvh, Closest, Hit, LeanBvh, closest_point_on_triangle};
 pub use files::{Dropped, read_mesh, read_mesh_lenient, read_ply, write_mesh};
 pub use glb::write_glb;
 pub use kd_tree::KdTree;

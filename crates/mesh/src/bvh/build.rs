@@ -75,6 +75,12 @@ fn bounds_of(corners: &[Point3<f64>; 3]) -> Box3 {
 }
 
 pub(super) fn build(mesh: &TriangleMesh) -> Bvh {
+    let mut bvh = build_without_corners(mesh);
+    bvh.corners = bvh.triangles.par_iter().map(|&t| mesh.triangle(t as usize)).collect();
+    bvh
+}
+
+pub(super) fn build_without_corners(mesh: &TriangleMesh) -> Bvh {
     let mut primitives: Vec<Primitive> = (0..mesh.triangles.len())
         .into_par_iter()
         .filter_map(|index| {
@@ -86,8 +92,7 @@ pub(super) fn build(mesh: &TriangleMesh) -> Bvh {
     let (nodes, root) =
         if primitives.is_empty() { (Vec::new(), Child::default()) } else { subtree(&mut primitives, 0, 0) };
     let triangles: Vec<u32> = primitives.par_iter().map(|p| p.triangle).collect();
-    let corners = triangles.par_iter().map(|&t| mesh.triangle(t as usize)).collect();
-    Bvh { nodes, root, corners, triangles }
+    Bvh { nodes, root, corners: Vec::new(), triangles }
 }
 
 /// Builds the subtree over `primitives`, which stand at `first` in the final order and are reordered in place. Inner

@@ -47,7 +47,13 @@ fn box_distances_sq(node: &Node, p: &[f64; 3]) -> [f64; 2] {
     sum
 }
 
-pub(super) fn closest(bvh: &Bvh, query: &Point3<f64>, max_distance: f64) -> Option<Closest> {
+/// `corners` gives the corners of an entry of `bvh.triangles`.
+pub(super) fn closest<C: std::borrow::Borrow<[Point3<f64>; 3]>>(
+    bvh: &Bvh,
+    corners: impl Fn(usize) -> C,
+    query: &Point3<f64>,
+    max_distance: f64,
+) -> Option<Closest> {
     if bvh.is_empty() || !vector(query).iter().all(|v| v.is_finite()) {
         return None;
     }
@@ -60,8 +66,9 @@ pub(super) fn closest(bvh: &Bvh, query: &Point3<f64>, max_distance: f64) -> Opti
     loop {
         if current.count > 0 {
             let range = current.first as usize..(current.first + current.count) as usize;
-            for (corners, &triangle) in bvh.corners[range.clone()].iter().zip(&bvh.triangles[range]) {
-                let point = closest_point_on_triangle(query, corners);
+            for entry in range {
+                let triangle = bvh.triangles[entry];
+                let point = closest_point_on_triangle(query, corners(entry).borrow());
                 let distance_sq = (point - query).norm_squared();
                 let tie = distance_sq == best_sq && best.is_none_or(|(t, _)| triangle < t);
                 if distance_sq < best_sq || tie {

@@ -4,7 +4,7 @@ use mb_geometry::Ray;
 use nalgebra::{Point3, Vector3};
 use proptest::prelude::*;
 
-use super::{Bvh, closest_point_on_triangle};
+use super::{Bvh, LeanBvh, closest_point_on_triangle};
 use crate::TriangleMesh;
 
 fn soup() -> impl Strategy<Value = TriangleMesh> {
@@ -30,6 +30,8 @@ proptest! {
             .map(|t| (closest_point_on_triangle(&q, &mesh.triangle(t)) - q).norm())
             .fold(f64::INFINITY, f64::min);
         prop_assert!((found.distance - brute).abs() < 1e-14);
+        prop_assert_eq!(LeanBvh::new(&mesh).closest_within(&q, f64::INFINITY), Some(found));
+        prop_assert_eq!(LeanBvh::new(&mesh).closest_within(&q, 0.999 * found.distance), None);
         let on = closest_point_on_triangle(&found.point, &mesh.triangle(found.triangle as usize));
         prop_assert!((on - found.point).norm() < 1e-12);
     }

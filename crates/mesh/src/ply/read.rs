@@ -28,6 +28,13 @@ pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<(TriangleMesh, Dropped)
             .help("Export or copy the file again")
             .into());
         }
+        // Never more items than bytes, whatever the header says.
+        let items = element.count.min(values.remaining() as u64) as usize;
+        match element.name.as_str() {
+            "vertex" => builder.reserve(items, 0),
+            "face" => builder.reserve(0, items),
+            _ => {}
+        }
         match element.name.as_str() {
             "vertex" => reader.vertices(element, &mut values, &mut builder)?,
             "face" => reader.faces(element, &mut values, &mut builder)?,
