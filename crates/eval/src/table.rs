@@ -1,5 +1,7 @@
 //! Tables of methods: the paper's four, with rows of one's own beside the published ones.
 
+mod compare;
+mod documents;
 mod lint;
 mod paper;
 mod render;
@@ -7,6 +9,8 @@ mod significance;
 
 use serde::Serialize;
 
+pub use compare::{Comparison, Difference, compare};
+pub use documents::{MethodScores, SequenceValues};
 pub use lint::{ImpossibleRow, lint};
 pub use paper::{PaperTable, SOURCE};
 pub use significance::{PairedDifference, paired_bootstrap};
@@ -83,6 +87,22 @@ impl std::str::FromStr for TableFormat {
             "html" => Self::Html,
             _ => return Err(format!("no table format {name:?}; there are text, csv, markdown, latex and html")),
         })
+    }
+}
+
+impl TableFormat {
+    /// Every format.
+    pub const ALL: [Self; 5] = [Self::Text, Self::Csv, Self::Markdown, Self::Latex, Self::Html];
+
+    /// The extension of its files.
+    pub fn extension(self) -> &'static str {
+        match self {
+            Self::Text => "txt",
+            Self::Csv => "csv",
+            Self::Markdown => "md",
+            Self::Latex => "tex",
+            Self::Html => "html",
+        }
     }
 }
 

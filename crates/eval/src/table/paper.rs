@@ -1,7 +1,8 @@
 //! The published numbers.
 
+use serde::Serialize;
+
 use super::{Better, Column, Row, Table};
-use crate::{DepthMetrics, SurfaceMean, ViewsScores};
 
 /// Where the published numbers come from.
 pub const SOURCE: &str = "Li et al., MobileBrick: Building LEGO for 3D Reconstruction on Mobile Devices, CVPR 2023, \
@@ -9,7 +10,8 @@ pub const SOURCE: &str = "Li et al., MobileBrick: Building LEGO for 3D Reconstru
                           (Voxurf by way of PoRF, ICLR 2024; GS2Mesh, ECCV 2024)";
 
 /// The four tables of the paper.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum PaperTable {
     /// Accuracy, recall, F1 and Chamfer distance of reconstructed surfaces.
     Surfaces,
@@ -58,6 +60,34 @@ const POSES: [(&str, [Option<f64>; 4]); 3] = [
 impl PaperTable {
     /// The four, in the order of the paper.
     pub const ALL: [Self; 4] = [Self::Surfaces, Self::Views, Self::Depth, Self::Poses];
+
+    /// The name on the command line, and of the files that hold the table.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Surfaces => "surfaces",
+            Self::Views => "views",
+            Self::Depth => "depth",
+            Self::Poses => "poses",
+        }
+    }
+
+    /// The protocol whose numbers may stand beside the published ones.
+    pub fn protocol(self) -> &'static str {
+        match self {
+            Self::Surfaces => crate::SurfaceProtocol::MobileBrick2023.name(),
+            Self::Views => crate::VIEWS_PROTOCOL,
+            Self::Depth => crate::DEPTH_PROTOCOL,
+            Self::Poses => crate::POSES_PROTOCOL,
+        }
+    }
+
+    /// The column by which methods are compared: F1 at 2.5 mm, PSNR, AbsRel, translation.
+    pub fn headline(self) -> usize {
+        match self {
+            Self::Surfaces => 2,
+            Self::Views | Self::Depth | Self::Poses => 0,
+        }
+    }
 
     /// The table as published.
     pub fn published(self) -> Table {
@@ -108,26 +138,12 @@ fn row<const N: usize>(method: &str, input: &str, origin: &str, values: [Option<
     Row { method: method.to_owned(), input: input.to_owned(), origin: origin.to_owned(), values: values.to_vec() }
 }
 
-impl Row {
-    /// A row of [`PaperTable::Surfaces`] from our own means. `origin` names the protocol and program.
-    pub fn of_surfaces(method: &str, input: &str, origin: &str, mean: &SurfaceMean) -> Self {
-        let at = |mm: f64| mean.thresholds.iter().find(move |t| t.threshold_mm == mm);
-        let shares = |mm: f64| match at(mm) {
-            Some(t) => [t.accuracy, t.recall, t.f1].map(|v| Some(100.0 * v)),
-            None => [None; 3],
-        };
-        let ([a, b, c], [d, e, f]) = (shares(2.5), shares(5.0));
-        row(method, input, origin, [a, b, c, d, e, f, Some(mean.chamfer.chamfer_mm)])
-    }
-
-    /// A row of [`PaperTable::Views`].
-    pub fn of_views(method: &str, origin: &str, scores: &ViewsScores) -> Self {
-        row(method, "RGB", origin, [Some(scores.psnr), Some(scores.ssim), scores.lpips])
-    }
-
-    /// A row of [`PaperTable::Depth`].
-    pub fn of_depth(method: &str, origin: &str, m: &DepthMetrics) -> Self {
-        let values = [m.abs_rel, m.sq_rel, m.rmse_m, m.rmse_log, m.delta1, m.delta2, m.delta3];
-        row(method, "", origin, values.map(Some))
+/// From the lower-case name.
+impl std::str::FromStr for PaperTable {
+    type Err = String;
+    fn from_str(name: &str) -> Result<Self, String> {
+        let names = Self::ALL.map(Self::name);
+        let found = Self::ALL.into_iter().find(|t| t.name() == name);
+        found.ok_or_else(|| format!("no table {name:?}; there are {}", names.join(", ")))
     }
 }

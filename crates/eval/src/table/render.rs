@@ -1,6 +1,6 @@
 //! Tables as text.
 
-use super::{Table, TableFormat};
+use super::{Comparison, Table, TableFormat};
 use crate::surface::quoted;
 
 impl Table {
@@ -76,28 +76,22 @@ impl Table {
     }
 
     fn latex(&self) -> String {
-        let escape: fn(&str) -> String = |text| {
-            let special = |c| matches!(c, '&' | '%' | '$' | '#' | '_' | '{' | '}');
-            text.chars().flat_map(|c| special(c).then_some('\\').into_iter().chain([c])).collect()
-        };
-        let headings: Vec<String> = self.headings().into_iter().map(escape).collect();
+        let headings: Vec<String> = self.headings().into_iter().map(escape_latex).collect();
         let mut text = format!("\\begin{{tabular}}{{lll{}}}\n\\toprule\n", "r".repeat(self.columns.len()));
         text += &format!("{} \\\\\n\\midrule\n", headings.join(" & "));
-        for row in self.cells(escape, |cell| format!("\\textbf{{{cell}}}")) {
+        for row in self.cells(escape_latex, |cell| format!("\\textbf{{{cell}}}")) {
             text += &format!("{} \\\\\n", row.join(" & "));
         }
         text + "\\bottomrule\n\\end{tabular}\n"
     }
 
     fn html(&self) -> String {
-        let escape: fn(&str) -> String =
-            |text| text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;");
-        let mut text = format!("<table>\n<caption>{}</caption>\n<thead><tr>", escape(&self.title));
+        let mut text = format!("<table>\n<caption>{}</caption>\n<thead><tr>", escape_html(&self.title));
         for heading in self.headings() {
-            text += &format!("<th>{}</th>", escape(heading));
+            text += &format!("<th>{}</th>", escape_html(heading));
         }
         text += "</tr></thead>\n<tbody>\n";
-        for row in self.cells(escape, |cell| format!("<strong>{cell}</strong>")) {
+        for row in self.cells(escape_html, |cell| format!("<strong>{cell}</strong>")) {
             text += "<tr>";
             for cell in row {
                 text += &format!("<td>{cell}</td>");
@@ -105,6 +99,52 @@ impl Table {
             text += "</tr>\n";
         }
         text + "</tbody>\n</table>\n"
+    }
+}
+
+fn escape_latex(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' | '%' | '$' | '#' | '_' | '{' | '}' => out.extend(['\\', c]),
+            '\\' => out += "\\textbackslash{}",
+            '^' => out += "\\^{}",
+            '~' => out += "\\~{}",
+            _ => out.push(c),
+        }
+    }
+    out
+}
+
+fn escape_html(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+impl Comparison {
+    /// The table with what should be known about it: below it for people, as comments in LaTeX. CSV holds the table
+    /// alone.
+    pub fn render(&self, format: TableFormat) -> String {
+        let table = self.rows.render(format);
+        let sentences = self.sentences();
+        let lines = |before: &str, after: &str, escape: fn(&str) -> String| {
+            sentences.iter().map(|s| format!("{before}{}{after}\n", escape(s))).collect::<String>()
+        };
+        match format {
+            TableFormat::Csv => table,
+            TableFormat::Text => table + &lines("  ", "", str::to_owned),
+            TableFormat::Markdown => format!("### {}\n\n{table}\n{}", self.rows.title, lines("- ", "", str::to_owned)),
+            TableFormat::Latex => format!("% {}\n{table}{}", self.rows.title, lines("% ", "", str::to_owned)),
+            TableFormat::Html => format!("{table}<ul>\n{}</ul>\n", lines("<li>", "</li>", escape_html)),
+        }
+    }
+
+    /// What should be known about the table, one sentence each.
+    pub fn sentences(&self) -> Vec<String> {
+        let impossible =
+            self.impossible.iter().map(|i| format!("impossible: {}, {}: {}", i.method, i.column, i.reason));
+        let differences = self.differences.iter().map(super::Difference::sentence);
+        let source = self.source.map(|source| format!("published rows: {source}"));
+        impossible.chain(self.notes.iter().cloned()).chain(differences).chain(source).collect()
     }
 }
 
