@@ -1,7 +1,7 @@
 """The published scorer's algorithm on Open3D 0.19 and scikit-learn, for its CPU time beside `surface.rs`.
 
     python3 -m venv venv && venv/bin/pip install open3d==0.19.0 scikit-learn
-    venv/bin/python crates/eval/benches/published_scorer.py SEQUENCE PREDICTION
+    venv/bin/python crates/eval/benches/published_scorer.py SEQUENCE PREDICTION [POINTS]
 """
 
 import sys
@@ -10,8 +10,6 @@ import time
 import numpy as np
 import open3d as o3d
 from sklearn.neighbors import NearestNeighbors
-
-POINTS = 100_000
 
 
 def inside(mesh, volume):
@@ -28,12 +26,12 @@ def nearest(queries, points):
     return tree.kneighbors(queries)[0][:, 0]
 
 
-def main(sequence, prediction):
+def main(sequence, prediction, points=100_000):
     start = time.process_time()
     volume = np.load(f"{sequence}/visibility_mask.npy", allow_pickle=True).item()
     truth = o3d.io.read_triangle_mesh(f"{sequence}/mesh/gt_mesh.ply")
     found = o3d.io.read_triangle_mesh(prediction)
-    truth_points = np.asarray(truth.sample_points_poisson_disk(POINTS).points)
+    truth_points = np.asarray(truth.sample_points_poisson_disk(int(points)).points)
     registration = o3d.pipelines.registration
     icp = registration.registration_icp(
         o3d.geometry.PointCloud(truth.vertices),
@@ -46,7 +44,7 @@ def main(sequence, prediction):
     if icp.fitness > 0.99:
         found.transform(np.linalg.inv(icp.transformation))
     found.remove_vertices_by_mask(~inside(found, volume))
-    found_points = np.asarray(found.sample_points_poisson_disk(POINTS).points)
+    found_points = np.asarray(found.sample_points_poisson_disk(int(points)).points)
     print(f"fitness {icp.fitness:.6f}")
     # The script computes every distance once per threshold.
     for threshold in (0.0025, 0.005):

@@ -38,7 +38,7 @@ impl Default for DepthOptions {
 }
 
 /// The standard metrics over some pixels, d the predicted and g the true depth in metres.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DepthMetrics {
     /// Mean of |d - g| / g.
     pub abs_rel: f64,

@@ -27,16 +27,18 @@ pub use depth::{
 pub use perceptual::PerceptualMetric;
 pub use poses::{ObjectPair, POSES_PROTOCOL, PoseErrors, PosePair, PosesScores, evaluate_poses, score_poses};
 pub use surface::{
-    Aligned, AlignedMean, Chamfer, Confidence95, Curve, CurvePoint, ExactScores, Icp, Interval, MissingScore,
-    SurfaceMean, SurfaceOptions, SurfaceProtocol, SurfaceScores, SurfaceTable, SurfaceTruth, ThresholdIntervals,
-    ThresholdScore, distances_to_surface_m, evaluate_surface, evaluate_surface_method, read_sequence_list,
-    score_surface, vertex_distances_mm,
+    Aligned, AlignedMean, AlignmentEffect, Breakdown, Chamfer, Confidence95, Coverage, Curve, CurvePoint, DtuScores,
+    ExactScores, F1Change, FileHash, Floaters, Group, GroupThreshold, Icp, Interval, MissingScore, Normals, OfAngle,
+    OfPart, OfRegion, OfViews, PUBLISHED_TEST_SEQUENCES, Provenance, Region, SurfaceMean, SurfaceOptions,
+    SurfaceProtocol, SurfaceScores, SurfaceTable, SurfaceTruth, ThresholdIntervals, ThresholdScore,
+    distances_to_surface_m, evaluate_surface, evaluate_surface_method, read_sequence_list, score_surface,
+    vertex_distances_mm,
 };
 pub use table::{
-    Better, Column, ImpossibleRow, PairedDifference, PaperTable, Row, SOURCE, Table, TableFormat, lint,
-    paired_bootstrap,
+    Better, Column, Comparison, Difference, ImpossibleRow, MethodScores, PairedDifference, PaperTable, Row, SOURCE,
+    SequenceValues, Table, TableFormat, compare, lint, paired_bootstrap,
 };
 pub use views::{
     ColorImage, SequenceViews, Similarity, VIEWS_PROTOCOL, ViewScore, ViewsOptions, ViewsScores, ViewsTable,
-    evaluate_views, evaluate_views_method, psnr_of_mse, similarity,
+    evaluate_views, evaluate_views_method, psnr_of_mse, similarity, similarity_of_pixels,
 };

@@ -3,16 +3,22 @@
 //! [`evaluate_surface`] scores one file against a sequence's ground truth, [`score_surface`] the same in memory,
 //! [`evaluate_surface_method`] a method over a list of sequences. `docs/metrics.md` defines every number by protocol.
 
+mod breakdown;
 mod clip;
 mod curve;
 mod distance;
+mod dtu;
 mod exact;
 mod icp;
 mod input;
 mod method;
+mod provenance;
 mod published;
 mod rigid;
+mod samples;
 mod score;
+mod setting;
+mod tanks;
 
 use std::path::Path;
 use std::time::Instant;
@@ -21,12 +27,20 @@ use mb_job::{InputError, Progress, Result};
 use mb_mesh::TriangleMesh;
 use serde::{Deserialize, Serialize};
 
+pub use breakdown::{
+    Breakdown, Coverage, Floaters, Group, GroupThreshold, Normals, OfAngle, OfPart, OfRegion, OfViews, Region,
+};
 pub use curve::{Curve, CurvePoint};
 pub use distance::{distances_to_surface_m, vertex_distances_mm};
-pub use exact::{Aligned, Confidence95, ExactScores, Interval, ThresholdIntervals};
+pub use dtu::DtuScores;
+pub use exact::{Aligned, AlignmentEffect, Confidence95, ExactScores, F1Change, Interval, ThresholdIntervals};
 pub use input::SurfaceTruth;
 pub(crate) use method::quoted;
-pub use method::{AlignedMean, MissingScore, SurfaceMean, SurfaceTable, evaluate_surface_method, read_sequence_list};
+pub use method::{
+    AlignedMean, MissingScore, PUBLISHED_TEST_SEQUENCES, SurfaceMean, SurfaceTable, evaluate_surface_method,
+    read_sequence_list,
+};
+pub use provenance::{FileHash, Provenance};
 pub(crate) use score::f1;
 pub use score::{Chamfer, ThresholdScore};
 
@@ -40,17 +54,25 @@ pub enum SurfaceProtocol {
     /// Exact distances between exact surfaces, nothing aligned in secret.
     #[serde(rename = "exact-1")]
     Exact1,
+    /// Mean distances without outliers, as the DTU benchmark scores.
+    #[serde(rename = "dtu-style-1")]
+    DtuStyle1,
+    /// F-scores of registered and thinned clouds, as Tanks and Temples scores.
+    #[serde(rename = "tnt-style-1")]
+    TntStyle1,
 }
 
 impl SurfaceProtocol {
     /// Every protocol.
-    pub const ALL: [Self; 2] = [Self::MobileBrick2023, Self::Exact1];
+    pub const ALL: [Self; 4] = [Self::MobileBrick2023, Self::Exact1, Self::DtuStyle1, Self::TntStyle1];
 
     /// The name in documents and on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::MobileBrick2023 => "mobilebrick-2023",
             Self::Exact1 => "exact-1",
+            Self::DtuStyle1 => "dtu-style-1",
+            Self::TntStyle1 => "tnt-style-1",
         }
     }
 }
@@ -132,7 +154,7 @@ impl SurfaceOptions {
 }
 
 /// What the hidden alignment of the published protocol found.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Icp {
     /// Share of the ground truth's vertices with a vertex of the prediction within 20 mm, after the last iteration.
     pub fitness: f64,
@@ -145,13 +167,13 @@ pub struct Icp {
 }
 
 /// The score of one prediction.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SurfaceScores {
     /// The protocol.
     pub protocol: SurfaceProtocol,
     /// Name of the sequence.
     pub sequence: String,
-    /// The published protocol's alignment; in `exact-1` computed for information and never applied.
+    /// The alignment: applied by `mobilebrick-2023` above its cliff, by `tnt-style-1` always, by the others never.
     pub icp: Icp,
     /// Mean distances.
     #[serde(flatten)]
@@ -163,12 +185,17 @@ pub struct SurfaceScores {
     /// What only `exact-1` measures.
     #[serde(flatten)]
     pub exact: Option<ExactScores>,
+    /// What only `dtu-style-1` measures.
+    #[serde(flatten)]
+    pub dtu: Option<DtuScores>,
     /// Points on the ground truth and on the prediction that were compared.
     pub points: [usize; 2],
     /// Seed of the sampling.
     pub seed: u64,
     /// The ground truth's mesh, relative to the sequence.
     pub ground_truth: String,
+    /// The program and the files that made the score; `None` for meshes in memory.
+    pub provenance: Option<Provenance>,
     /// What a reader of the score should know.
     pub warnings: Vec<String>,
     /// Wall time of scoring without reading files.
@@ -189,7 +216,10 @@ pub fn evaluate_surface(
     options.validate()?;
     let truth = SurfaceTruth::read(gt, options.protocol)?;
     let prediction = mb_mesh::read_mesh(pred)?;
-    score_surface(&truth, prediction, pred, options, progress)
+    let provenance = Provenance::of(pred, &truth.mesh_path, &gt.join("visibility_mask.npy"))?;
+    let mut scores = score_surface(&truth, prediction, pred, options, progress)?;
+    scores.provenance = Some(provenance);
+    Ok(scores)
 }
 
 /// Scores a prediction in memory. `name` is the file that errors speak of.
@@ -209,6 +239,8 @@ pub fn score_surface(
     let mut scores = match options.protocol {
         SurfaceProtocol::MobileBrick2023 => published::score(truth, prediction, name, options, progress)?,
         SurfaceProtocol::Exact1 => exact::score(truth, &prediction, name, options, progress)?,
+        SurfaceProtocol::DtuStyle1 => dtu::score(truth, &prediction, name, options, progress)?,
+        SurfaceProtocol::TntStyle1 => tanks::score(truth, &prediction, name, options, progress)?,
     };
     warnings.append(&mut scores.warnings);
     scores.warnings = warnings;

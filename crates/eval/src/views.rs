@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 pub use published::{SequenceViews, ViewsTable, evaluate_views_method};
-pub use similarity::{ColorImage, Similarity, psnr_of_mse, similarity};
+pub use similarity::{ColorImage, Similarity, psnr_of_mse, similarity, similarity_of_pixels};
 
 use crate::PerceptualMetric;
 use crate::pairing::{Pair, pair_by_name, some};

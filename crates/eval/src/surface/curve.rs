@@ -1,11 +1,11 @@
 //! Threshold curves.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::score::{Distances, f1};
 
 /// Accuracy, recall and F1 over all thresholds.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Curve {
     /// Area under accuracy over thresholds from 0 to [`Curve::LIMIT_MM`], as a share of the whole: 1 is perfect.
     pub accuracy_auc: f64,
@@ -18,7 +18,7 @@ pub struct Curve {
 }
 
 /// One threshold of a curve.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct CurvePoint {
     /// The threshold, millimetres.
     pub threshold_mm: f64,

@@ -1,27 +1,20 @@
 //! Exact distances to surfaces of any size.
 
-use mb_mesh::{Bvh, Closest, KdTree, TriangleMesh};
+use mb_mesh::{Bvh, Closest, KdTree, LeanBvh, TriangleMesh};
 use nalgebra::Point3;
 use rayon::prelude::*;
 
-/// Triangles per search tree. Larger meshes are searched piece by piece, so that memory stays near 200 bytes times this
-/// beside the mesh itself.
-const PIECE: usize = 8_000_000;
+/// Larger meshes are searched with a tree that needs a quarter of the memory, and some more time.
+const LARGE: usize = 8_000_000;
 
 /// Distances below this are rounding: a sample of a triangle lies off the triangle by some 1e-16 m.
 const ZERO_M: f64 = 1e-9;
 
 /// Something that distances are measured to: the surface of a mesh, or the points of a cloud.
 pub(super) enum Target<'a> {
-    Surface {
-        mesh: &'a TriangleMesh,
-        /// The tree, where one is enough.
-        whole: Option<Bvh>,
-    },
-    Points {
-        points: &'a [Point3<f64>],
-        tree: KdTree,
-    },
+    Surface(Bvh),
+    LargeSurface(LeanBvh<'a>),
+    Points { points: &'a [Point3<f64>], tree: KdTree },
 }
 
 impl<'a> Target<'a> {
@@ -30,8 +23,19 @@ impl<'a> Target<'a> {
         if mesh.triangles.is_empty() {
             return Self::Points { points: &mesh.vertices, tree: KdTree::new(&mesh.vertices) };
         }
-        let whole = (mesh.triangles.len() <= PIECE).then(|| Bvh::new(mesh));
-        Self::Surface { mesh, whole }
+        if mesh.triangles.len() > LARGE {
+            Self::LargeSurface(LeanBvh::new(mesh))
+        } else {
+            Self::Surface(Bvh::new(mesh))
+        }
+    }
+
+    /// The tree for rays; `None` for clouds and very large meshes.
+    pub fn bvh(&self) -> Option<&Bvh> {
+        match self {
+            Self::Surface(bvh) => Some(bvh),
+            Self::LargeSurface(_) | Self::Points { .. } => None,
+        }
     }
 
     /// The closest point to each query, and its triangle (for a cloud: its point's index). `None` where nothing lies
@@ -45,25 +49,8 @@ impl<'a> Target<'a> {
                     Some(Closest { triangle: index as u32, point: points[index], distance })
                 })
                 .collect(),
-            Self::Surface { whole: Some(bvh), .. } => {
-                queries_in_parallel().map(|q| bvh.closest_within(q, max_distance_m)).collect()
-            }
-            Self::Surface { mesh, whole: None } => {
-                let mut best: Vec<Option<Closest>> = vec![None; queries.len()];
-                for first in (0..mesh.triangles.len()).step_by(PIECE) {
-                    let last = (first + PIECE).min(mesh.triangles.len());
-                    let bvh = Bvh::new(&piece(mesh, first..last));
-                    best.par_iter_mut().with_min_len(64).zip(queries).for_each(|(best, q)| {
-                        let limit = best.map_or(max_distance_m, |b| b.distance);
-                        if let Some(found) = bvh.closest_within(q, limit)
-                            && best.is_none_or(|b| found.distance < b.distance)
-                        {
-                            *best = Some(Closest { triangle: found.triangle + first as u32, ..found });
-                        }
-                    });
-                }
-                best
-            }
+            Self::Surface(bvh) => queries_in_parallel().map(|q| bvh.closest_within(q, max_distance_m)).collect(),
+            Self::LargeSurface(bvh) => queries_in_parallel().map(|q| bvh.closest_within(q, max_distance_m)).collect(),
         }
     }
 
@@ -80,27 +67,6 @@ pub(super) fn distance_m(closest: Option<&Closest>) -> f64 {
         Some(closest) => closest.distance,
         None => f64::INFINITY,
     }
-}
-
-/// Some triangles of a mesh, with only the vertices that they use.
-fn piece(mesh: &TriangleMesh, range: std::ops::Range<usize>) -> TriangleMesh {
-    const UNUSED: u32 = u32::MAX;
-    let mut new_index = vec![UNUSED; mesh.vertices.len()];
-    let mut vertices = Vec::new();
-    let triangles = mesh.triangles[range]
-        .iter()
-        .map(|t| {
-            t.map(|v| {
-                let index = &mut new_index[v as usize];
-                if *index == UNUSED {
-                    *index = vertices.len() as u32;
-                    vertices.push(mesh.vertices[v as usize]);
-                }
-                *index
-            })
-        })
-        .collect();
-    TriangleMesh::new(vertices, triangles)
 }
 
 /// Distance in metres of each point from the surface of `mesh` (from its vertices, where it has no triangles); infinite
@@ -134,13 +100,5 @@ mod tests {
         let cloud = TriangleMesh::new(vec![Point3::new(0.0, 0.0, 1.0)], vec![]);
         assert_eq!(vertex_distances_mm(&square_at(0.0), &cloud)[0], 1000.0);
         assert!(vertex_distances_mm(&cloud, &TriangleMesh::default())[0].is_infinite());
-    }
-
-    #[test]
-    fn a_piece_holds_its_triangles() {
-        let mesh = square_at(0.0);
-        let second = piece(&mesh, 1..2);
-        assert_eq!(second.triangle(0), mesh.triangle(1));
-        assert_eq!(second.vertices.len(), 3);
     }
 }

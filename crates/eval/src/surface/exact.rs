@@ -2,30 +2,34 @@
 
 use std::path::Path;
 
-use mb_job::{InputError, Progress, Result, Steps};
-use mb_mesh::{SurfaceSample, TriangleMesh, sample_uniform};
+use mb_job::{Progress, Result, Steps};
+use mb_mesh::TriangleMesh;
 use nalgebra::Point3;
 use rand::RngExt;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
+use super::breakdown::{self, Breakdown};
 use super::clip::Clipper;
 use super::curve::Curve;
 use super::distance::Target;
 use super::rigid;
+use super::samples::{bare, compared, judged_samples, truth_samples};
 use super::score::{Chamfer, Distances, ThresholdScore, f1, mean};
-use super::{Icp, SurfaceOptions, SurfaceProtocol, SurfaceScores, SurfaceTruth, nothing_visible};
+use super::{SurfaceOptions, SurfaceProtocol, SurfaceScores, SurfaceTruth, nothing_visible};
 
 /// What `exact-1` measures beyond the common scores.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ExactScores {
     /// 95 % confidence intervals of the scores.
     pub confidence_95: Confidence95,
     /// The same scores after the prediction was moved rigidly onto the ground truth.
     pub aligned: Aligned,
+    /// Where the score comes from.
+    pub breakdown: Breakdown,
 }
 
 /// Scores after rigid alignment.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Aligned {
     /// Rotation of the alignment, degrees.
     pub rotation_deg: f64,
@@ -36,12 +40,44 @@ pub struct Aligned {
     pub chamfer: Chamfer,
     /// One entry per threshold, ascending.
     pub thresholds: Vec<ThresholdScore>,
+    /// What the alignment changed.
+    pub effect: AlignmentEffect,
+}
+
+/// Aligned less unaligned: how much of a score is owed to the poses rather than to the surface.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct AlignmentEffect {
+    /// Change of the Chamfer distance, millimetres; below 0 the alignment helps.
+    pub chamfer_mm: f64,
+    /// Change of F1 at each threshold; above 0 the alignment helps.
+    pub f1: Vec<F1Change>,
+}
+
+/// Change of F1 at one threshold.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct F1Change {
+    /// The threshold, millimetres.
+    pub threshold_mm: f64,
+    /// Aligned less unaligned.
+    pub change: f64,
+}
+
+impl AlignmentEffect {
+    fn of(before: &Distances, after: &Distances, thresholds_mm: &[f64]) -> Self {
+        let (before_f1, after_f1) = (before.thresholds(thresholds_mm), after.thresholds(thresholds_mm));
+        let change =
+            |(a, b): (&ThresholdScore, &ThresholdScore)| F1Change { threshold_mm: a.threshold_mm, change: b.f1 - a.f1 };
+        Self {
+            chamfer_mm: after.chamfer().chamfer_mm - before.chamfer().chamfer_mm,
+            f1: before_f1.iter().zip(&after_f1).map(change).collect(),
+        }
+    }
 }
 
 /// Intervals by a block bootstrap: each surface's samples, in the order of its triangles, are cut into
 /// [`Confidence95::BLOCKS`] patches, and patches are drawn with replacement [`Confidence95::RESAMPLES`] times. They tell
 /// how far a score hangs on a few places of the surface.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Confidence95 {
     /// Chamfer distance, millimetres.
     pub chamfer_mm: Interval,
@@ -54,7 +90,7 @@ pub struct Confidence95 {
 }
 
 /// Intervals at one threshold.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ThresholdIntervals {
     /// The threshold, millimetres.
     pub threshold_mm: f64,
@@ -67,8 +103,13 @@ pub struct ThresholdIntervals {
 }
 
 /// Lower and upper bound: the 2.5 and 97.5 % quantiles.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Interval(pub f64, pub f64);
+
+/// Rays start this far from an exact surface, metres: touching walls of two bricks coincide.
+const EXACT_LIFT_M: f64 = 1e-5;
+/// Rays start this far from a fused surface, metres: its error is below half a voxel.
+const FUSED_LIFT_M: f64 = 1e-3;
 
 pub(super) fn score(
     truth: &SurfaceTruth,
@@ -80,25 +121,24 @@ pub(super) fn score(
     let steps = Steps::new(progress, "scoring the surface", 4);
     let mut warnings = Vec::new();
     let clipper = Clipper::new(&truth.visibility);
-    let gt_judged = clipper.clip(&truth.mesh);
-    let gt_points = points(sample_uniform(&gt_judged.mesh, options.points, options.truth_seed()));
-    if gt_points.is_empty() {
-        let help = "mesh/ and visibility_mask.npy do not belong together; make both with `mobilebrick truth`";
-        let found = "no part of the ground truth lies inside the visible volume";
-        return Err(InputError::new(&truth.mesh_path, found).help(help).into());
-    }
+    let gt_samples = truth_samples(truth, &clipper, |_| options.points, options)?;
     if prediction.triangles.is_empty() {
         warnings.push("the prediction is a point cloud; distances to it are distances to its points".to_owned());
     }
+    warnings.extend(truth.setting.notes.iter().cloned());
+    let gt_points: Vec<Point3<f64>> = gt_samples.iter().map(|s| s.point).collect();
     let gt_target = Target::new(&truth.mesh);
     let pred_target = Target::new(prediction);
     steps.step()?;
 
     // The clip decides which points are judged, not what they are compared with: surfaces are whole on the other side.
-    let as_it_is = {
-        let pred_points = judged_points(prediction, &clipper, options).ok_or_else(|| nothing_visible(name))?;
-        let gt_to_pred_m = pred_target.distances_m(&gt_points);
-        Distances { pred_to_gt_m: gt_target.distances_m(&pred_points), gt_to_pred_m }
+    let pred_samples =
+        judged_samples(prediction, &clipper, |_| options.points, options).ok_or_else(|| nothing_visible(name))?;
+    let pred_judged = compared(&pred_samples, &gt_target);
+    let gt_judged = compared(&gt_samples, &pred_target);
+    let as_it_is = Distances {
+        pred_to_gt_m: pred_judged.iter().map(|j| j.distance_m).collect(),
+        gt_to_pred_m: gt_judged.iter().map(|j| j.distance_m).collect(),
     };
     steps.step()?;
 
@@ -107,11 +147,12 @@ pub(super) fn score(
     let moved = if alignment.is_rest(&middle) {
         None
     } else {
-        let moved_prediction = prediction.clone().transformed(&alignment.pred_from_gt.inverse());
-        judged_points(&moved_prediction, &clipper, options)
+        let moved_prediction = bare(prediction).transformed(&alignment.pred_from_gt.inverse());
+        judged_samples(&moved_prediction, &clipper, |_| options.points, options)
     };
     steps.step()?;
-    let aligned = moved.map(|pred_points| {
+    let aligned = moved.map(|pred_samples| {
+        let pred_points: Vec<Point3<f64>> = pred_samples.iter().map(|s| s.point).collect();
         let gt_in_pred: Vec<Point3<f64>> = gt_points.iter().map(|p| alignment.pred_from_gt * *p).collect();
         Distances {
             pred_to_gt_m: gt_target.distances_m(&pred_points),
@@ -121,13 +162,22 @@ pub(super) fn score(
     steps.step()?;
 
     let thresholds_mm = options.thresholds_mm();
+    let breakdown = Breakdown::of(&breakdown::Parts {
+        gt: &truth.mesh,
+        gt_bvh: gt_target.bvh(),
+        lift_m: if truth.is_exact() { EXACT_LIFT_M } else { FUSED_LIFT_M },
+        prediction,
+        setting: &truth.setting,
+        gt_points: &gt_judged,
+        pred_points: &pred_judged,
+        thresholds_mm: &thresholds_mm,
+    });
     let best = aligned.as_ref().unwrap_or(&as_it_is);
-    let rotation_deg = alignment.pred_from_gt.angle_rad().to_degrees();
-    let translation_mm = 1000.0 * (alignment.pred_from_gt * middle - middle).norm();
+    let icp = alignment.describe(truth, false);
     Ok(SurfaceScores {
         protocol: SurfaceProtocol::Exact1,
         sequence: truth.sequence.clone(),
-        icp: Icp { fitness: alignment.fitness, applied: false, rotation_deg, translation_mm },
+        icp,
         chamfer: as_it_is.chamfer(),
         thresholds: as_it_is.thresholds(&thresholds_mm),
         curve: Curve::of(&as_it_is),
@@ -135,33 +185,21 @@ pub(super) fn score(
         exact: Some(ExactScores {
             confidence_95: Confidence95::of(&as_it_is, &thresholds_mm, options.seed),
             aligned: Aligned {
-                rotation_deg,
-                translation_mm,
+                rotation_deg: icp.rotation_deg,
+                translation_mm: icp.translation_mm,
                 chamfer: best.chamfer(),
                 thresholds: best.thresholds(&thresholds_mm),
+                effect: AlignmentEffect::of(&as_it_is, best, &thresholds_mm),
             },
+            breakdown,
         }),
+        dtu: None,
         seed: options.seed,
         ground_truth: truth.relative_mesh_path(),
+        provenance: None,
         warnings,
         seconds: 0.0,
     })
-}
-
-fn points(samples: Vec<SurfaceSample>) -> Vec<Point3<f64>> {
-    samples.into_iter().map(|s| s.point).collect()
-}
-
-/// Random points of the prediction inside the visible volume; `None` where there is none.
-fn judged_points(prediction: &TriangleMesh, clipper: &Clipper, options: &SurfaceOptions) -> Option<Vec<Point3<f64>>> {
-    let seed = options.prediction_seed();
-    let found = if prediction.triangles.is_empty() {
-        let visible: Vec<Point3<f64>> = prediction.vertices.iter().filter(|v| clipper.contains(v)).copied().collect();
-        super::published::shuffled(visible, options.points, seed)
-    } else {
-        points(sample_uniform(&clipper.clip(prediction).mesh, options.points, seed))
-    };
-    (!found.is_empty()).then_some(found)
 }
 
 impl Confidence95 {

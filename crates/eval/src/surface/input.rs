@@ -8,6 +8,7 @@ use mb_mesh::{KdTree, TriangleMesh, sample_uniform};
 use nalgebra::{Matrix3, Point3};
 
 use super::SurfaceProtocol;
+use super::setting::Setting;
 
 /// The ground truth of one sequence.
 #[derive(Debug, Clone)]
@@ -20,6 +21,8 @@ pub struct SurfaceTruth {
     pub mesh_path: PathBuf,
     /// Where predictions can be judged.
     pub visibility: VisibilityVolume,
+    /// What is known of the scene; read for `exact-1` alone.
+    pub(super) setting: Setting,
 }
 
 impl SurfaceTruth {
@@ -37,7 +40,8 @@ impl SurfaceTruth {
         let exact = sequence.join("mesh/visible_surface.ply");
         let published = sequence.join("mesh/gt_mesh.ply");
         let mesh_path = match protocol {
-            SurfaceProtocol::Exact1 if exact.exists() => exact,
+            SurfaceProtocol::MobileBrick2023 => published,
+            _ if exact.exists() => exact,
             _ => published,
         };
         let visibility_path = sequence.join("visibility_mask.npy");
@@ -55,7 +59,16 @@ impl SurfaceTruth {
         let absolute = std::path::absolute(sequence).unwrap_or_else(|_| sequence.to_owned());
         let name = absolute.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let visibility = VisibilityVolume::read(visibility_path)?;
-        Ok(Self { sequence: name, mesh, mesh_path, visibility })
+        let setting = match protocol {
+            SurfaceProtocol::Exact1 => Setting::read(sequence),
+            _ => Setting::default(),
+        };
+        Ok(Self { sequence: name, mesh, mesh_path, visibility, setting })
+    }
+
+    /// Whether the surface is the model's own and not a fused one.
+    pub(super) fn is_exact(&self) -> bool {
+        self.mesh_path.ends_with("mesh/visible_surface.ply")
     }
 
     /// The mesh's path inside the sequence, for documents.

@@ -3,14 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use mb_job::{Error, InputError, Progress, Result, Steps, write_atomic};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
-use super::{
-    Chamfer, ExactScores, SurfaceOptions, SurfaceProtocol, SurfaceScores, SurfaceTruth, ThresholdScore, score_surface,
-};
+use super::{Chamfer, ExactScores, SurfaceOptions, SurfaceProtocol, SurfaceScores, ThresholdScore, evaluate_surface};
 
 /// Scores of one method.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SurfaceTable {
     /// Name of the method.
     pub method: String,
@@ -25,12 +23,16 @@ pub struct SurfaceTable {
     /// Sequences of the list without a score; they are in no mean.
     pub missing: Vec<MissingScore>,
     /// The list, in order.
-    #[serde(skip)]
-    list: Vec<String>,
+    pub list: Vec<String>,
+    /// Folder with the ground truth's sequences, as it was given.
+    pub root: PathBuf,
+    /// What the person who reads the numbers should know.
+    #[serde(default)]
+    pub warnings: Vec<String>,
 }
 
 /// A sequence that could not be scored.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MissingScore {
     /// Its name.
     pub sequence: String,
@@ -39,7 +41,7 @@ pub struct MissingScore {
 }
 
 /// Means over sequences, as the published tables average.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SurfaceMean {
     /// Number of sequences in the means.
     pub sequences: usize,
@@ -53,7 +55,7 @@ pub struct SurfaceMean {
 }
 
 /// Means over sequences after rigid alignment.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AlignedMean {
     /// Mean distances.
     #[serde(flatten)]
@@ -61,6 +63,28 @@ pub struct AlignedMean {
     /// Means of the shares.
     pub thresholds: Vec<ThresholdScore>,
 }
+
+/// The test sequences of the paper, in the order of the published list.
+pub const PUBLISHED_TEST_SEQUENCES: [&str; 18] = [
+    "aston",
+    "audi",
+    "beetles",
+    "big_ben",
+    "boat",
+    "bridge",
+    "cabin",
+    "camera",
+    "castle",
+    "colosseum",
+    "convertible",
+    "ferrari",
+    "jeep",
+    "london_bus",
+    "motorcycle",
+    "porsche",
+    "satellite",
+    "space_shuttle",
+];
 
 /// Reads a list of sequences: names separated by commas or line ends. The published list is one line with commas and no
 /// line end. Blanks, empty entries, and lines that begin with `#` are skipped.
@@ -134,9 +158,11 @@ pub fn evaluate_surface_method(
         protocol: options.protocol,
         options: options.clone(),
         mean: SurfaceMean::of(&sequences),
+        warnings: missing.iter().map(|m| format!("no score for {}: {}", m.sequence, m.reason)).collect(),
         sequences,
         missing,
         list: list.to_vec(),
+        root: root.to_owned(),
     })
 }
 
@@ -146,9 +172,7 @@ fn score_one(truth: &Path, predictions: &Path, name: &str, options: &SurfaceOpti
     let Some(path) = candidates.iter().find(|path| path.exists()) else {
         return Err(InputError::new(&candidates[0], "no prediction for this sequence").into());
     };
-    let truth = SurfaceTruth::read(truth, options.protocol)?;
-    let prediction = mb_mesh::read_mesh(path)?;
-    score_surface(&truth, prediction, path, options, &mb_job::Silent)
+    evaluate_surface(truth, path, options, &mb_job::Silent)
 }
 
 impl SurfaceMean {
@@ -186,6 +210,18 @@ fn mean_of(scores: &[(&Chamfer, &[ThresholdScore])]) -> Option<(Chamfer, Vec<Thr
 }
 
 impl SurfaceTable {
+    /// Reads the `scores.json` that [`SurfaceTable::write`] wrote.
+    ///
+    /// # Errors
+    /// The file is missing, or no such document.
+    pub fn read(path: &Path) -> Result<Self> {
+        let bytes = std::fs::read(path).map_err(|e| InputError::unreadable(path, &e))?;
+        serde_json::from_slice(&bytes).map_err(|e| {
+            let help = "Expected the scores.json of `mobilebrick eval surface --method NAME ... -o DIR`";
+            InputError::new(path, format!("no table of surface scores: {e}")).help(help).into()
+        })
+    }
+
     /// Writes `data.csv` as the published script does, `scores.csv` with named columns, and `scores.json`.
     ///
     /// # Errors
@@ -236,6 +272,8 @@ impl SurfaceTable {
                     cells.extend(number_cells(&s.chamfer, &s.thresholds));
                     if let Some(ExactScores { aligned, .. }) = &s.exact {
                         cells.extend(number_cells(&aligned.chamfer, &aligned.thresholds));
+                        cells.push(aligned.effect.chamfer_mm.to_string());
+                        cells.extend(aligned.effect.f1.iter().map(|f| f.change.to_string()));
                     }
                 }
                 None => {
@@ -253,6 +291,8 @@ impl SurfaceTable {
             cells.extend(number_cells(&mean.chamfer, &mean.thresholds));
             if let Some(aligned) = &mean.aligned {
                 cells.extend(number_cells(&aligned.chamfer, &aligned.thresholds));
+                cells.push((aligned.chamfer.chamfer_mm - mean.chamfer.chamfer_mm).to_string());
+                cells.extend(aligned.thresholds.iter().zip(&mean.thresholds).map(|(a, b)| (a.f1 - b.f1).to_string()));
             }
             cells.resize(lines[0].len(), String::new());
             lines.push(cells);
@@ -270,6 +310,8 @@ fn column_names(thresholds_mm: &[f64]) -> Vec<String> {
             names.extend(["accuracy", "recall", "f1"].map(|name| format!("{prefix}{name}_{t}mm")));
         }
     }
+    names.push("icp_effect_chamfer_mm".to_owned());
+    names.extend(thresholds_mm.iter().map(|t| format!("icp_effect_f1_{t}mm")));
     names.push("missing".to_owned());
     names
 }

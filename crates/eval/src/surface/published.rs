@@ -68,9 +68,11 @@ pub(super) fn score(
         thresholds: distances.thresholds(&options.thresholds_mm()),
         curve: Curve::of(&distances),
         exact: None,
+        dtu: None,
         points: [gt_points.len(), pred_points.len()],
         seed: options.seed,
         ground_truth: truth.relative_mesh_path(),
+        provenance: None,
         warnings,
         seconds: 0.0,
     })
@@ -131,7 +133,8 @@ pub(super) fn shuffled(mut points: Vec<Point3<f64>>, count: usize, seed: u64) ->
     points
 }
 
-fn nearest_m(queries: &[Point3<f64>], points: &[Point3<f64>]) -> Vec<f64> {
+/// The distance of each query from the nearest of the points.
+pub(super) fn nearest_m(queries: &[Point3<f64>], points: &[Point3<f64>]) -> Vec<f64> {
     let tree = KdTree::new(points);
     let distance = |p| tree.nearest(p).map_or(f64::INFINITY, |(_, d)| d);
     queries.par_iter().with_min_len(256).map(distance).collect()

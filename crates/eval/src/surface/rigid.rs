@@ -5,6 +5,7 @@ use mb_mesh::TriangleMesh;
 use nalgebra::{Matrix6, Point3, SymmetricEigen, Vector3, Vector6};
 
 use super::distance::Target;
+use super::{Icp, SurfaceTruth};
 
 /// Ground-truth points that take part.
 const POINTS: usize = 5_000;
@@ -41,11 +42,8 @@ pub(super) fn align(gt_points: &[Point3<f64>], mesh: &TriangleMesh, target: &Tar
         for (p, closest) in moved.iter().zip(&closest) {
             let Some(closest) = closest else { continue };
             let normals = match target {
-                Target::Surface { .. } => {
-                    let normal = mesh.scaled_normal(closest.triangle as usize).try_normalize(0.0);
-                    [normal, None, None]
-                }
                 Target::Points { .. } => [Some(Vector3::x()), Some(Vector3::y()), Some(Vector3::z())],
+                _ => [mesh.scaled_normal(closest.triangle as usize).try_normalize(0.0), None, None],
             };
             // Radii scaled to 1, so that rotations and translations weigh alike.
             let arm = (p.coords - middle) / radius;
@@ -84,6 +82,17 @@ fn solve(stiffness: &Matrix6<f64>, pull: &Vector6<f64>) -> Vector6<f64> {
 }
 
 impl Alignment {
+    /// In numbers for people.
+    pub fn describe(&self, truth: &SurfaceTruth, applied: bool) -> Icp {
+        let middle = truth.mesh.bounds().center();
+        Icp {
+            fitness: self.fitness,
+            applied,
+            rotation_deg: self.pred_from_gt.angle_rad().to_degrees(),
+            translation_mm: 1000.0 * (self.pred_from_gt * middle - middle).norm(),
+        }
+    }
+
     /// Whether it moves nothing: points around `middle` stay where they are up to rounding.
     pub fn is_rest(&self, middle: &Point3<f64>) -> bool {
         let moved = self.pred_from_gt * *middle;

@@ -1,9 +1,9 @@
 //! From distances to scores.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Mean distances in both directions.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Chamfer {
     /// Sum of both means, millimetres.
     pub chamfer_mm: f64,
@@ -21,7 +21,7 @@ impl Chamfer {
 }
 
 /// Shares of points within a threshold.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ThresholdScore {
     /// The threshold, millimetres.
     pub threshold_mm: f64,

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use mb_job::{InputError, Progress, Result, Steps};
+use mb_job::{Error, InputError, Progress, Result, Steps, write_atomic};
 use serde::Serialize;
 
 use super::{VIEWS_PROTOCOL, ViewsOptions, ViewsScores, evaluate_views};
@@ -97,6 +97,18 @@ pub fn evaluate_views_method(
 }
 
 impl ViewsTable {
+    /// Writes `data.csv` as the published script does for surfaces, and `scores.json`.
+    ///
+    /// # Errors
+    /// A file cannot be written.
+    pub fn write(&self, folder: &Path, sequences: &[String]) -> Result<()> {
+        write_atomic(folder.join("data.csv"), self.to_csv(sequences).as_bytes())?;
+        let path = folder.join("scores.json");
+        let mut json = serde_json::to_vec_pretty(self).map_err(|e| Error::write(&path, e.into()))?;
+        json.push(b'\n');
+        write_atomic(path, &json)
+    }
+
     /// Rows as the published surface script writes them: the names of the sequences, then a row for each of PSNR, SSIM
     /// and LPIPS. A missing sequence keeps its column, empty.
     pub fn to_csv(&self, sequences: &[String]) -> String {

@@ -7,6 +7,7 @@
 //! The arithmetic has one fixed order, whatever the processor and the number of threads: every machine finds the same
 //! bits.
 
+use mb_geometry::ImageSize;
 use mb_image::{Image, Mask};
 use rayon::prelude::*;
 
@@ -48,11 +49,25 @@ const LANES: usize = 16;
 /// Compares two images of one size; with a mask, over its true pixels alone (their windows still see the rest).
 /// `None` where the sizes differ or no pixel is compared.
 pub fn similarity(a: &ColorImage, b: &ColorImage, mask: Option<&Mask>) -> Option<Similarity> {
-    let size = a.size();
-    let pixels = mask.map_or(size.pixels(), |m| m.data().iter().filter(|&&m| m).count());
-    if b.size() != size || mask.is_some_and(|m| m.size() != size) || pixels == 0 {
+    if a.size() != b.size() {
         return None;
     }
+    similarity_of_pixels(a.size(), a.data(), b.data(), mask)
+}
+
+/// Like [`similarity`], of pixels that lie elsewhere: `[H, W]`, row after row. `None` where there are not as many as
+/// `size` says.
+pub fn similarity_of_pixels(
+    size: ImageSize,
+    a: &[[f32; 3]],
+    b: &[[f32; 3]],
+    mask: Option<&Mask>,
+) -> Option<Similarity> {
+    let pixels = mask.map_or(size.pixels(), |m| m.data().iter().filter(|&&m| m).count());
+    if [a.len(), b.len()] != [size.pixels(); 2] || mask.is_some_and(|m| m.size() != size) || pixels == 0 {
+        return None;
+    }
+    let (a, b) = (Pixels { size, values: a }, Pixels { size, values: b });
     let bands: Vec<usize> = (0..size.height).step_by(BAND_ROWS).collect();
     let sums: Vec<Sums> = bands.par_iter().map(|&first| band(a, b, mask, first)).collect();
     let (mut squares, mut ssim) = (0.0, 0.0);
@@ -71,6 +86,19 @@ pub fn psnr_of_mse(mse: f64) -> f64 {
     if mse < MSE_FLOOR { -10.0 * MSE_FLOOR.log10() } else { -10.0 * mse.log10() }
 }
 
+/// An image's pixels, wherever they lie.
+#[derive(Clone, Copy)]
+struct Pixels<'a> {
+    size: ImageSize,
+    values: &'a [[f32; 3]],
+}
+
+impl<'a> Pixels<'a> {
+    fn row(&self, y: usize) -> &'a [[f32; 3]] {
+        &self.values[y * self.size.width..(y + 1) * self.size.width]
+    }
+}
+
 /// Sums over the compared values of a band.
 #[derive(Default)]
 struct Sums {
@@ -78,7 +106,7 @@ struct Sums {
     ssim: f64,
 }
 
-fn band(a: &ColorImage, b: &ColorImage, mask: Option<&Mask>, first: usize) -> Sums {
+fn band(a: Pixels<'_>, b: Pixels<'_>, mask: Option<&Mask>, first: usize) -> Sums {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
         // SAFETY: the processor has the instructions that the function is compiled for.
@@ -90,7 +118,7 @@ fn band(a: &ColorImage, b: &ColorImage, mask: Option<&Mask>, first: usize) -> Su
 /// The portable code, compiled for wider vectors. Fused multiply-add stays off: it would change the last bits.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn band_avx2(a: &ColorImage, b: &ColorImage, mask: Option<&Mask>, first: usize) -> Sums {
+fn band_avx2(a: Pixels<'_>, b: Pixels<'_>, mask: Option<&Mask>, first: usize) -> Sums {
     band_portable(a, b, mask, first)
 }
 
@@ -106,8 +134,8 @@ fn window() -> [f32; RADIUS + 1] {
 
 /// Rows `first..first + BAND_ROWS`: slides down each strip, keeping the horizontally blurred maps of 11 rows.
 #[inline(always)]
-fn band_portable(a: &ColorImage, b: &ColorImage, mask: Option<&Mask>, first: usize) -> Sums {
-    let (width, height) = (a.width() * CHANNELS, a.height());
+fn band_portable(a: Pixels<'_>, b: Pixels<'_>, mask: Option<&Mask>, first: usize) -> Sums {
+    let (width, height) = (a.size.width * CHANNELS, a.size.height);
     let rows = BAND_ROWS.min(height - first);
     let window = window();
     let mut sums = Sums::default();
