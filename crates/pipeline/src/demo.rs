@@ -101,7 +101,7 @@ pub fn demo(model: &Model, options: &DemoOptions, out: &Path, progress: &dyn Pro
     })?;
 
     let mut scores = Vec::new();
-    for protocol in SurfaceProtocol::ALL {
+    for protocol in [SurfaceProtocol::MobileBrick2023, SurfaceProtocol::Exact1] {
         let surface = SurfaceOptions { protocol, seed: options.seed, ..SurfaceOptions::default() };
         let name = format!("eval surface, {protocol}");
         scores.push(log.run(&name, &surface, || evaluate_surface(&folder, &mesh_path, &surface, progress))?);

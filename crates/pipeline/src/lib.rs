@@ -5,11 +5,14 @@
 //! puts them in order.
 
 mod demo;
+mod leaderboard;
 mod model_capture;
+mod pictures;
 mod report;
 mod scene_report;
 
 pub use demo::{DemoOptions, DemoSummary, demo};
+pub use leaderboard::{LeaderboardOptions, LeaderboardSummary, leaderboard};
 pub use model_capture::{ModelCapture, simulate_model};
 pub use report::{ColorScale, Curves, Gallery, Picture, Report, Stage, Table};
 pub use scene_report::{Scored, scene_report};

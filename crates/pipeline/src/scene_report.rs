@@ -4,23 +4,21 @@
 use std::path::PathBuf;
 
 use mb_capture::{Frame, Sequence};
-use mb_eval::{SurfaceProtocol, SurfaceScores, SurfaceTruth, vertex_distances_mm};
+use mb_eval::{SurfaceProtocol, SurfaceScores, SurfaceTruth};
 use mb_geometry::ImageSize;
 use mb_image::{DepthImage, RgbImage};
 use mb_job::{Progress, Result, Steps};
 use mb_mesh::TriangleMesh;
-use mb_render::{ShadeOptions, heat_colors, over, overlay_edges, shade, three_quarter_view};
+use mb_render::{heat_colors, overlay_edges};
 use mb_truth::ExactScene;
 use nalgebra::Vector3;
 
+use crate::pictures::{HEAT_LIMIT_MM, Studio, heated};
 use crate::report::{ColorScale, Curves, Gallery, Picture, Report, Table};
 
-/// Colours of all heat maps end here, millimetres: the larger of the two published thresholds.
-const HEAT_LIMIT_MM: f64 = 5.0;
 /// Depth differences are shown up to this, millimetres.
 const DEPTH_LIMIT_MM: f64 = 10.0;
 const PICTURE: ImageSize = ImageSize::new(900, 700);
-const PAPER: [u8; 3] = [244, 246, 249];
 const EDGE: [u8; 3] = [255, 40, 160];
 
 /// A method's result with its scores, one entry per protocol.
@@ -221,28 +219,22 @@ fn error_galleries(
     method: &Scored,
     up: &Vector3<f64>,
 ) -> Result<Vec<Gallery>> {
-    let prediction = judged_part(mb_mesh::read_mesh(&method.mesh)?, truth);
-    let options = ShadeOptions { up: *up, smooth: true, ground: false, ..ShadeOptions::default() };
-    let bounds = truth.mesh.bounds();
+    let studio = Studio { truth, up: *up, size: PICTURE };
+    let prediction = studio.judged_part(mb_mesh::read_mesh(&method.mesh)?);
     let angles = [("front", 0.6), ("back", 0.6 + std::f64::consts::PI)];
-    let draw = |caption: String, mesh: &TriangleMesh, azimuth: f64, options: &ShadeOptions| {
-        let view = three_quarter_view::<mb_geometry::World>(&bounds, up, PICTURE, azimuth, 0.45);
-        Picture { caption, image: over(&shade(mesh, &view, options), PAPER) }
-    };
-    let heated = |mesh: &TriangleMesh, against: &TriangleMesh| {
-        let distances: Vec<f64> = vertex_distances_mm(mesh, against).into_iter().map(f64::from).collect();
-        let colors = heat_colors(&distances, 0.0, HEAT_LIMIT_MM);
-        TriangleMesh { vertex_colors: Some(colors), triangle_colors: None, ..mesh.clone() }
+    let draw = |caption: String, mesh: &TriangleMesh, azimuth: f64, smooth: bool| Picture {
+        caption,
+        image: studio.look(mesh, azimuth, smooth),
     };
     let wrong = heated(&prediction, &truth.mesh);
     let missing = heated(&truth.mesh, &prediction);
     let mut looks = Vec::new();
     let mut errors = Vec::new();
     for (side, azimuth) in angles {
-        looks.push(draw(format!("model, {side}"), &exact.mesh, azimuth, &ShadeOptions { smooth: false, ..options }));
-        looks.push(draw(format!("{}, {side}", method.method), &prediction, azimuth, &options));
-        errors.push(draw(format!("wrong: {} to truth, {side}", method.method), &wrong, azimuth, &options));
-        errors.push(draw(format!("missing: truth to {}, {side}", method.method), &missing, azimuth, &options));
+        looks.push(draw(format!("model, {side}"), &exact.mesh, azimuth, false));
+        looks.push(draw(format!("{}, {side}", method.method), &prediction, azimuth, true));
+        errors.push(draw(format!("wrong: {} to truth, {side}", method.method), &wrong, azimuth, true));
+        errors.push(draw(format!("missing: truth to {}, {side}", method.method), &missing, azimuth, true));
     }
     Ok(vec![
         Gallery {
@@ -258,18 +250,4 @@ fn error_galleries(
             scale: Some(color_scale(HEAT_LIMIT_MM)),
         },
     ])
-}
-
-/// The triangles of which every corner can be judged: without the table around and whatever lies behind.
-fn judged_part(mesh: TriangleMesh, truth: &SurfaceTruth) -> TriangleMesh {
-    let inside: Vec<bool> = mesh.vertices.iter().map(|p| truth.visibility.contains(p)).collect();
-    let keep = |t: &[u32; 3]| t.iter().all(|&v| inside[v as usize]);
-    let kept: Vec<usize> = (0..mesh.triangles.len()).filter(|&t| keep(&mesh.triangles[t])).collect();
-    let pick = |colors: &Vec<[u8; 3]>| kept.iter().map(|&t| colors[t]).collect();
-    TriangleMesh {
-        triangles: kept.iter().map(|&t| mesh.triangles[t]).collect(),
-        triangle_colors: mesh.triangle_colors.as_ref().map(pick),
-        triangle_parts: None,
-        ..mesh
-    }
 }

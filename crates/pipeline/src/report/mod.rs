@@ -1,6 +1,6 @@
 //! The report: one self-contained HTML page, pictures and charts inside.
 
-mod chart;
+pub(crate) mod chart;
 mod overview;
 
 use std::io::Cursor;
@@ -175,7 +175,8 @@ fn gallery(gallery: &Gallery) -> Result<Markup> {
     })
 }
 
-fn gradient(colors: &[[u8; 3]]) -> String {
+/// A colour bar as a CSS background.
+pub(crate) fn gradient(colors: &[[u8; 3]]) -> String {
     let stops: Vec<String> = colors.iter().map(|[r, g, b]| format!("rgb({r},{g},{b})")).collect();
     format!("background:linear-gradient(to right,{})", stops.join(","))
 }
