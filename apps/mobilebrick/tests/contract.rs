@@ -176,3 +176,47 @@ fn the_published_scorers_list_of_two_predictions_is_scored_with_the_missing_one_
     assert_eq!(table["missing"][0]["sequence"], "absent");
     assert!(out.join("data.csv").exists() && out.join("scores.csv").exists());
 }
+
+/// The published scripts' folders and options, their rows, and what is made from the scores.
+#[test]
+fn a_folder_of_the_published_scripts_becomes_rows_tables_and_a_site() {
+    let Some(official) = mb_testdata::find("official_scorer") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let meshes = dir.path().join("meshes/mine");
+    std::fs::create_dir_all(&meshes).unwrap();
+    std::fs::copy(official.join("preds/noise1mm.ply"), meshes.join("wedge.ply")).unwrap();
+    std::fs::create_dir_all(dir.path().join("evaluations")).unwrap();
+    std::fs::write(dir.path().join("evaluations/test_seqs.txt"), "wedge,absent,skipped").unwrap();
+    let run = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_mobilebrick"));
+        let output = command.current_dir(dir.path()).args(arguments).args(["--json", "-q"]).output().unwrap();
+        assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+        serde_json::from_slice::<Value>(&output.stdout).unwrap()
+    };
+    let root = std::path::absolute(&official).unwrap();
+    let scores =
+        ["eval", "surface", "--method", "mine", "--gt_root", text(&root), "--skip", "skipped", "--n_pts", "5000"];
+    assert_eq!(run(&scores)["missing"][0]["sequence"], "absent");
+    let csv = std::fs::read_to_string(meshes.join("data.csv")).unwrap();
+    assert!(csv.starts_with("wedge,absent\r\n"), "beside the meshes, as the script writes it: {csv}");
+    assert_eq!(csv.lines().count(), 9);
+
+    let views = dir.path().join("nvs/mine/wedge");
+    std::fs::create_dir_all(&views).unwrap();
+    for name in ["gt_000000.png", "render_000000.png"] {
+        std::fs::copy(official.join("nvs").join(name), views.join(name)).unwrap();
+    }
+    assert_eq!(run(&["eval", "views", "--method", "mine"])["missing_sequences"][0], "absent");
+
+    let tables = run(&["bench", "table", "meshes/mine", "nvs/mine", "-o", "tables"]);
+    let rows = tables["tables"][0]["rows"].as_array().unwrap();
+    assert_eq!(rows.last().unwrap()["method"], "mine");
+    assert_eq!(tables["tables"][0]["impossible"][0]["method"], "BNV-Fusion");
+    for file in ["surfaces.txt", "surfaces.csv", "surfaces.md", "surfaces.tex", "surfaces.html", "views.tex"] {
+        assert!(dir.path().join("tables").join(file).exists(), "{file}");
+    }
+    let site = run(&["bench", "leaderboard", "meshes/mine", "nvs/mine", "-o", "site", "--no-pictures"]);
+    assert_eq!(site["sequences"].as_array().unwrap().len(), 2);
+    assert!(dir.path().join("site/sequences/wedge.html").exists());
+    failure(&["bench", "table", text(&dir.path().join("nothing.json"))], 3);
+}

@@ -1,14 +1,14 @@
 //! `eval`: scores of surfaces, views, depth maps and poses.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 use mb_eval::{
-    DepthOptions, PerceptualMetric, SurfaceOptions, SurfaceProtocol, ThresholdScore, ViewsOptions, evaluate_depth,
-    evaluate_poses, evaluate_surface, evaluate_surface_method, evaluate_views, evaluate_views_method,
-    read_sequence_list,
+    DepthOptions, PUBLISHED_TEST_SEQUENCES, PerceptualMetric, SurfaceOptions, SurfaceProtocol, ThresholdScore,
+    ViewsOptions, evaluate_depth, evaluate_poses, evaluate_surface, evaluate_surface_method, evaluate_views,
+    evaluate_views_method, read_sequence_list,
 };
-use mb_job::{Error, Result, write_atomic};
+use mb_job::{Error, Result};
 use mb_perceptual::{Lpips, LpipsNet};
 
 use super::Seed;
@@ -56,10 +56,42 @@ struct Folders {
     pred: PathBuf,
 }
 
+/// The sequences of a table.
+#[derive(Debug, Args)]
+struct List {
+    /// File with the sequences' names, separated by commas or line ends; ./evaluations/test_seqs.txt, else the 18 published
+    /// test sequences
+    #[arg(long, value_name = "FILE", requires = "method", alias = "seq_txt")]
+    list: Option<PathBuf>,
+
+    /// Sequences to leave out
+    #[arg(long, value_name = "SEQ", requires = "method", num_args = 1..)]
+    skip: Vec<String>,
+}
+
+impl List {
+    /// Where the published repository keeps its list.
+    const PUBLISHED: &str = "evaluations/test_seqs.txt";
+
+    fn read(&self) -> Result<Vec<String>> {
+        let published = Path::new(Self::PUBLISHED);
+        let mut names = match &self.list {
+            Some(list) => read_sequence_list(list)?,
+            None if published.exists() => read_sequence_list(published)?,
+            None => PUBLISHED_TEST_SEQUENCES.map(str::to_owned).to_vec(),
+        };
+        if let Some(unknown) = self.skip.iter().find(|s| !names.contains(s)) {
+            return Err(Error::Failed(format!("--skip {unknown}: the list has no such sequence")));
+        }
+        names.retain(|name| !self.skip.contains(name));
+        Ok(names)
+    }
+}
+
 /// A reconstructed surface, or a method over a list of sequences
 ///
-/// One prediction: `--gt SEQ --pred MESH`. A table: `--method NAME --root DATA --list test_seqs.txt -o DIR`, with the
-/// predictions at ./meshes/NAME/SEQ.ply as the published scripts have them.
+/// One prediction: `--gt SEQ --pred MESH`. A table: `--method NAME`, with the predictions at ./meshes/NAME/SEQ.ply and the
+/// sequences in ./data as the published script has them; it takes that script's options too.
 #[derive(Debug, Args)]
 pub struct Surface {
     /// Sequence with the ground truth
@@ -71,31 +103,30 @@ pub struct Surface {
     pred: Option<PathBuf>,
 
     /// Method whose predictions lie in the folder of that name
-    #[arg(long, value_name = "NAME", requires_all = ["root", "list", "out"])]
+    #[arg(long, value_name = "NAME")]
     method: Option<String>,
 
     /// Folder that holds the sequences
-    #[arg(long, value_name = "DATA", requires = "method")]
-    root: Option<PathBuf>,
+    #[arg(long, value_name = "DATA", requires = "method", default_value = "data", alias = "gt_root")]
+    root: PathBuf,
 
-    /// File with the sequences' names, separated by commas or line ends
-    #[arg(long, value_name = "FILE", requires = "method")]
-    list: Option<PathBuf>,
+    #[command(flatten)]
+    list: List,
 
     /// Folder that holds a folder of meshes for each method
     #[arg(long, value_name = "DIR", default_value = "meshes")]
     meshes: PathBuf,
 
-    /// Folder for data.csv (as published), scores.csv and scores.json
+    /// Folder for data.csv (as published), scores.csv and scores.json; the predictions' own, as published
     #[arg(short, long, value_name = "DIR", requires = "method")]
     out: Option<PathBuf>,
 
-    /// mobilebrick-2023 (as published) or exact-1
+    /// mobilebrick-2023 (as published), exact-1, dtu-style-1 or tnt-style-1
     #[arg(long, default_value_t = SurfaceProtocol::default())]
     protocol: SurfaceProtocol,
 
     /// Points sampled on each surface
-    #[arg(long, value_name = "N", default_value_t = SurfaceOptions::default().points)]
+    #[arg(long, value_name = "N", default_value_t = SurfaceOptions::default().points, alias = "n_pts")]
     points: usize,
 
     /// A threshold beside 2.5 and 5 mm; may be repeated
@@ -114,21 +145,20 @@ impl Surface {
             seed: self.seed.seed,
             more_thresholds_mm: self.thresholds,
         };
-        if let (Some(method), Some(root), Some(list), Some(out)) = (self.method, self.root, self.list, self.out) {
-            let list = read_sequence_list(&list)?;
-            let table = evaluate_surface_method(&method, &self.meshes.join(&method), &root, &list, &options, terminal)?;
+        if let Some(method) = self.method {
+            let list = self.list.read()?;
+            let predictions = self.meshes.join(&method);
+            let table = evaluate_surface_method(&method, &predictions, &self.root, &list, &options, terminal)?;
+            let out = self.out.unwrap_or(predictions);
             table.write(&out)?;
             let mut text = format!("{method}: {} of {} sequences scored\n", table.sequences.len(), list.len());
             if let Some(mean) = &table.mean {
                 text += &score_lines(mean.chamfer.chamfer_mm, &mean.thresholds);
             }
-            for missing in &table.missing {
-                text += &format!("no score for {}: {}\n", missing.sequence, missing.reason);
-            }
             return Outcome::new(&table, text + &format!("wrote {}", out.display()));
         }
         let (Some(gt), Some(pred)) = (self.gt, self.pred) else {
-            return Err(Error::Failed("needs --gt and --pred, or --method, --root, --list and --out".into()));
+            return Err(Error::Failed("needs --gt and --pred, or --method".into()));
         };
         let scores = evaluate_surface(&gt, &pred, &options, terminal)?;
         let text = format!(
@@ -160,8 +190,8 @@ fn score_lines(chamfer_mm: f64, thresholds: &[ThresholdScore]) -> String {
 
 /// Novel views: PSNR, SSIM, LPIPS; images are paired by file name
 ///
-/// Two folders: `--gt DIR --pred DIR`. A method over a list of sequences: `--method NAME --list FILE -o DIR`, with the
-/// images at ./nvs/NAME/SEQ/{gt,render}_ID.png as the published scripts have them.
+/// Two folders: `--gt DIR --pred DIR`. A method over a list of sequences: `--method NAME`, with the images at
+/// ./nvs/NAME/SEQ/{gt,render}_ID.png as the published script has them; it takes that script's options too.
 #[derive(Debug, Args)]
 pub struct Views {
     /// Ground truth
@@ -173,18 +203,17 @@ pub struct Views {
     pred: Option<PathBuf>,
 
     /// Method whose views lie in the folder of that name
-    #[arg(long, value_name = "NAME", requires_all = ["list", "out"])]
+    #[arg(long, value_name = "NAME")]
     method: Option<String>,
 
-    /// File with the sequences' names, separated by commas or line ends
-    #[arg(long, value_name = "FILE", requires = "method")]
-    list: Option<PathBuf>,
+    #[command(flatten)]
+    list: List,
 
     /// Folder that holds a folder of views for each method
     #[arg(long, value_name = "DIR", default_value = "nvs")]
     nvs: PathBuf,
 
-    /// Folder for data.csv (as published)
+    /// Folder for data.csv and scores.json; the views' own
     #[arg(short, long, value_name = "DIR", requires = "method")]
     out: Option<PathBuf>,
 
@@ -217,14 +246,17 @@ impl Views {
             let lpips = lpips.map_or_else(|| "not computed: give --lpips-weights".to_owned(), |v| format!("{v:.4}"));
             format!("{images} images: PSNR {psnr:.2} dB, SSIM {ssim:.4}, LPIPS {lpips}")
         };
-        if let (Some(method), Some(list), Some(out)) = (self.method, self.list, self.out) {
-            let list = read_sequence_list(&list)?;
-            let table = evaluate_views_method(&self.nvs.join(method), &list, &options, perceptual, terminal)?;
-            write_atomic(out.join("data.csv"), table.to_csv(&list).as_bytes())?;
-            return Outcome::new(&table, line(table.images, table.psnr, table.ssim, table.lpips));
+        if let Some(method) = self.method {
+            let list = self.list.read()?;
+            let views = self.nvs.join(method);
+            let table = evaluate_views_method(&views, &list, &options, perceptual, terminal)?;
+            let out = self.out.unwrap_or(views);
+            table.write(&out, &list)?;
+            let text = line(table.images, table.psnr, table.ssim, table.lpips);
+            return Outcome::new(&table, format!("{text}\nwrote {}", out.display()));
         }
         let (Some(gt), Some(pred)) = (self.gt, self.pred) else {
-            return Err(Error::Failed("needs --gt and --pred, or --method, --list and --out".into()));
+            return Err(Error::Failed("needs --gt and --pred, or --method".into()));
         };
         let scores = evaluate_views(&gt, &pred, &options, perceptual, terminal)?;
         let text = line(scores.images, scores.psnr, scores.ssim, scores.lpips);

@@ -2,6 +2,7 @@
 //! [`Outcome`].
 
 mod align;
+mod bench;
 mod capture;
 mod demo;
 mod eval;
@@ -45,6 +46,9 @@ pub enum Command {
     /// Score surfaces, views, depth maps and poses
     #[command(subcommand)]
     Eval(eval::Eval),
+    /// Methods beside each other: tables, leaderboards, studies
+    #[command(subcommand)]
+    Bench(bench::Bench),
 }
 
 impl Command {
@@ -59,6 +63,7 @@ impl Command {
             Self::Reconstruct(c) => c.run(terminal),
             Self::Synthesize(c) => c.run(terminal),
             Self::Eval(c) => c.run(terminal),
+            Self::Bench(c) => c.run(terminal),
         }
     }
 }
