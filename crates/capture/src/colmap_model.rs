@@ -14,7 +14,7 @@ use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use crate::lens::{Distortion, Lens};
 
 /// COLMAP's camera models with their ids and numbers of parameters.
-const MODELS: [(&str, u32, usize); 12] = [
+const MODELS: [(&str, u32, usize); 18] = [
     ("SIMPLE_PINHOLE", 0, 3),
     ("PINHOLE", 1, 4),
     ("SIMPLE_RADIAL", 2, 4),
@@ -27,6 +27,12 @@ const MODELS: [(&str, u32, usize); 12] = [
     ("RADIAL_FISHEYE", 9, 5),
     ("THIN_PRISM_FISHEYE", 10, 12),
     ("RAD_TAN_THIN_PRISM_FISHEYE", 11, 16),
+    ("SIMPLE_DIVISION", 12, 4),
+    ("DIVISION", 13, 5),
+    ("SIMPLE_FISHEYE", 14, 3),
+    ("FISHEYE", 15, 4),
+    ("EUCM", 16, 6),
+    ("EQUIRECTANGULAR", 17, 2),
 ];
 
 /// One camera of a model.
@@ -55,11 +61,23 @@ pub(crate) struct ColmapModel {
 fn lens(model: &str, p: &[f64]) -> std::result::Result<Lens, String> {
     let radial = |k: [f64; 6], t: [f64; 2]| Distortion::Radial { k, p: t };
     let fisheye = |k: [f64; 4]| Distortion::Fisheye { k, p: [0.0; 2], s: [0.0; 2] };
+    if !p.iter().all(|v| v.is_finite()) {
+        return Err(format!("camera parameters {p:?} hold something that is not finite"));
+    }
+    if model == "EQUIRECTANGULAR" {
+        // Its parameters are width and height; the pinhole has the panorama's pixels per radian at its centre.
+        let (fx, fy) = (p[0] / std::f64::consts::TAU, p[1] / std::f64::consts::PI);
+        return lens_of(fx, fy, 0.5 * p[0], 0.5 * p[1], Distortion::Equirectangular);
+    }
     // Models with one focal length, then those with two.
     let (focal, rest) = match model {
-        "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "SIMPLE_RADIAL_FISHEYE" | "RADIAL_FISHEYE" => {
-            ((p[0], p[0]), &p[1..])
-        }
+        "SIMPLE_PINHOLE"
+        | "SIMPLE_RADIAL"
+        | "RADIAL"
+        | "SIMPLE_RADIAL_FISHEYE"
+        | "RADIAL_FISHEYE"
+        | "SIMPLE_DIVISION"
+        | "SIMPLE_FISHEYE" => ((p[0], p[0]), &p[1..]),
         _ => ((p[0], p[1]), &p[2..]),
     };
     let (cx, cy, c) = (rest[0], rest[1], &rest[2..]);
@@ -73,13 +91,27 @@ fn lens(model: &str, p: &[f64]) -> std::result::Result<Lens, String> {
         "SIMPLE_RADIAL_FISHEYE" => fisheye([c[0], 0.0, 0.0, 0.0]),
         "RADIAL_FISHEYE" => fisheye([c[0], c[1], 0.0, 0.0]),
         "THIN_PRISM_FISHEYE" => Distortion::Fisheye { k: [c[0], c[1], c[4], c[5]], p: [c[2], c[3]], s: [c[6], c[7]] },
+        "SIMPLE_FISHEYE" | "FISHEYE" => fisheye([0.0; 4]),
+        "RAD_TAN_THIN_PRISM_FISHEYE" => Distortion::RadTanThinPrism {
+            k: [c[0], c[1], c[2], c[3], c[4], c[5]],
+            p: [c[6], c[7]],
+            s: [c[8], c[9], c[10], c[11]],
+        },
         "FOV" => Distortion::FieldOfView { omega: c[0] },
-        other => return Err(format!("camera model {other} cannot be undistorted here; undistort with COLMAP first")),
+        "SIMPLE_DIVISION" | "DIVISION" => Distortion::Division { k: c[0] },
+        "EUCM" if (0.0..=1.0).contains(&c[0]) && c[1] > 0.0 => Distortion::EnhancedUnified { alpha: c[0], beta: c[1] },
+        "EUCM" => return Err(format!("alpha {} and beta {}, expected 0 to 1 and above 0", c[0], c[1])),
+        other => return Err(format!("camera model {other} is not known here")),
     };
-    if !(focal.0 > 0.0 && focal.1 > 0.0 && p.iter().all(|v| v.is_finite())) {
-        return Err(format!("camera parameters {p:?} hold a focal length that is not above 0, or no number"));
+    lens_of(focal.0, focal.1, cx, cy, distortion)
+}
+
+/// A lens from numbers in COLMAP's corner convention.
+fn lens_of(fx: f64, fy: f64, cx: f64, cy: f64, distortion: Distortion) -> std::result::Result<Lens, String> {
+    if !(fx > 0.0 && fy > 0.0) {
+        return Err(format!("the focal lengths are {fx} and {fy}, both must be above 0"));
     }
-    Ok(Lens { intrinsics: Intrinsics { fx: focal.0, fy: focal.1, cx: cx - 0.5, cy: cy - 0.5 }, distortion })
+    Ok(Lens { intrinsics: Intrinsics { fx, fy, cx: cx - 0.5, cy: cy - 0.5 }, distortion })
 }
 
 fn size(width: u64, height: u64) -> std::result::Result<ImageSize, String> {
@@ -166,7 +198,16 @@ impl ColmapModel {
             };
             let cam_from_world = pose([n[0], n[1], n[2], n[3]], [n[4], n[5], n[6]]).map_err(bad)?;
             model.images.push(ColmapImage { name: words[9..].join(" "), camera, cam_from_world });
-            lines.next();
+            // A model whose empty lines were stripped would lose every second image without a word.
+            if let Some((i, observations)) = lines.next() {
+                let words = observations.split_whitespace();
+                if words.clone().any(|w| w.parse::<f64>().is_err()) || words.count() % 3 != 0 {
+                    return Err(InputError::new(&path, "expected the image's observations, X Y POINT3D_ID each")
+                        .at_line(i + 1)
+                        .help("Every image has two lines, the second of which may be empty")
+                        .into());
+                }
+            }
         }
         Ok(model)
     }
@@ -323,5 +364,135 @@ impl Reader {
         }
         self.at += count as usize;
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Point2;
+
+    /// Where COLMAP (pycolmap 4.2.1) sees the points (0.31, -0.22, 1) and (-0.6, 0.45, 1) through each of its models.
+    const SEEN: [(&str, &[f64], [f64; 4]); 18] = [
+        ("SIMPLE_PINHOLE", &[500.0, 320.0, 240.0], [475.0, 130.0, 20.0, 465.0]),
+        ("PINHOLE", &[500.0, 510.0, 321.0, 239.0], [476.0, 126.8, 21.0, 468.5]),
+        ("SIMPLE_RADIAL", &[500.0, 320.0, 240.0, -0.1], [472.76025, 131.5895, 36.875_000_000_000_06, 452.34375]),
+        (
+            "RADIAL",
+            &[500.0, 320.0, 240.0, -0.1, 0.02],
+            [472.824_978_775, 131.543_563_45, 34.976_562_5, 453.767_578_125],
+        ),
+        (
+            "OPENCV",
+            &[500.0, 510.0, 321.0, 239.0, -0.1, 0.02, 0.003, -0.004],
+            [472.946_978_775, 129.021_879_719, 32.601_562_5, 459.624_804_687_5],
+        ),
+        (
+            "OPENCV_FISHEYE",
+            &[500.0, 510.0, 321.0, 239.0, -0.1, 0.02, 0.003, -0.004],
+            [467.219_190_924_607_9, 133.156_172_762_961_26, 73.351_041_168_853_44, 428.451_453_505_827_1],
+        ),
+        (
+            "FULL_OPENCV",
+            &[500.0, 510.0, 321.0, 239.0, -0.1, 0.02, 0.003, -0.004, 0.01, 0.02, -0.03, 0.004],
+            [472.604_656_550_923_1, 129.269_676_838_622_13, 32.771_138_102_284_57, 459.495_079_351_752_34],
+        ),
+        (
+            "FOV",
+            &[500.0, 510.0, 321.0, 239.0, 0.9],
+            [480.457_911_327_784_13, 123.573_047_413_049_17, 42.317_980_364_137_554, 452.191_745_021_434_77],
+        ),
+        (
+            "SIMPLE_RADIAL_FISHEYE",
+            &[500.0, 320.0, 240.0, -0.1],
+            [466.166_764_032_142_1, 136.268_748_106_221_75, 73.258_346_094_905_9, 425.056_240_428_820_6],
+        ),
+        (
+            "RADIAL_FISHEYE",
+            &[500.0, 320.0, 240.0, -0.1, 0.02],
+            [466.218_349_501_684_26, 136.232_139_063_320_86, 72.375_598_618_288_45, 425.718_301_036_283_6],
+        ),
+        (
+            "THIN_PRISM_FISHEYE",
+            &[500.0, 510.0, 321.0, 239.0, -0.1, 0.02, 0.003, -0.004, 0.01, 0.02, 0.005, -0.006],
+            [466.750_748_636_979_84, 133.341_127_614_512_46, 71.592_132_810_311_14, 429.321_845_905_733_6],
+        ),
+        (
+            "RAD_TAN_THIN_PRISM_FISHEYE",
+            &[
+                500.0, 510.0, 321.0, 239.0, -0.1, 0.02, 0.01, -0.004, 0.003, 0.001, 0.002, -0.003, 0.005, -0.006,
+                0.004, 0.002,
+            ],
+            [467.975_194_503_118_7, 132.981_267_731_502_84, 75.157_503_091_826_75, 428.104_933_543_877_2],
+        ),
+        (
+            "SIMPLE_DIVISION",
+            &[500.0, 320.0, 240.0, -0.2],
+            [470.762_101_881_229_8, 133.007_540_600_417_54, 47.787_389_494_360_58, 444.159_457_879_229_54],
+        ),
+        (
+            "DIVISION",
+            &[500.0, 510.0, 321.0, 239.0, 0.15],
+            [479.513_668_980_807_67, 124.256_557_034_537_96, -9.771_502_568_914_912, 492.040_199_465_219_9],
+        ),
+        (
+            "SIMPLE_FISHEYE",
+            &[500.0, 320.0, 240.0],
+            [468.121_362_460_431_95, 134.881_613_737_757_96, 62.599_556_482_686_296, 433.050_332_637_985_3],
+        ),
+        (
+            "FISHEYE",
+            &[500.0, 510.0, 321.0, 239.0],
+            [469.121_362_460_431_95, 131.779_246_012_513_1, 63.599_556_482_686_296, 435.911_339_290_745],
+        ),
+        (
+            "EUCM",
+            &[500.0, 510.0, 321.0, 239.0, 0.6, 1.1],
+            [469.193_864_735_936_13, 131.726_763_720_180_43, 63.130_829_804_871_61, 436.269_915_199_273_2],
+        ),
+        (
+            "EQUIRECTANGULAR",
+            &[1024.0, 512.0],
+            [560.991_107_388_107_3, 222.244_506_045_816_56, 423.925_314_753_213_1, 316.018_335_357_420_14],
+        ),
+    ];
+
+    #[test]
+    fn every_camera_model_sees_what_colmap_sees() {
+        assert_eq!(SEEN.len(), MODELS.len());
+        for (model, parameters, seen) in SEEN {
+            assert!(MODELS.iter().any(|m| m.0 == model && m.2 == parameters.len()), "{model}");
+            let lens = lens(model, parameters).unwrap();
+            let k = lens.intrinsics;
+            for (p, expected) in [(Point2::new(0.31, -0.22), &seen[..2]), (Point2::new(-0.6, 0.45), &seen[2..])] {
+                let bent = lens.distortion.distort(&p);
+                // The corner of COLMAP's images is (0, 0).
+                let found = [bent.x * k.fx + k.cx + 0.5, bent.y * k.fy + k.cy + 0.5];
+                let off = (found[0] - expected[0]).abs().max((found[1] - expected[1]).abs());
+                assert!(off < 1e-9, "{model}: {found:?}, COLMAP {expected:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_a_lens_cannot_see_has_no_pixel() {
+        // Beyond r = 1.12 the division model with k = 0.2 has no image; the fold of a polynomial is no image either.
+        let lens = lens("SIMPLE_DIVISION", &[50.0, 80.0, 60.0, 0.2]).unwrap();
+        assert!(lens.distortion.distort(&Point2::new(1.2, 0.0)).x.is_nan());
+        let photo = mb_image::RgbImage::filled(ImageSize::new(160, 120), [9; 3]);
+        let (_, valid) = lens.undistort(&photo);
+        assert!(valid[(80, 60)] && !valid[(0, 0)]);
+    }
+
+    #[test]
+    fn a_text_model_without_its_empty_lines_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("cameras.txt"), "1 PINHOLE 64 48 50 50 32 24\n").unwrap();
+        let image = |id: u32| format!("{id} 1 0 0 0 0 0 0 1 {id}.jpg\n");
+        std::fs::write(dir.path().join("images.txt"), image(1) + &image(2)).unwrap();
+        let message = ColmapModel::read(dir.path()).unwrap_err().to_string();
+        assert!(message.contains("images.txt: line 2") && message.contains("two lines"), "{message}");
+        std::fs::write(dir.path().join("images.txt"), image(1) + "1.5 2.5 -1\n" + &image(2)).unwrap();
+        assert_eq!(ColmapModel::read(dir.path()).unwrap().images.len(), 2);
     }
 }

@@ -27,11 +27,35 @@ pub enum Distortion {
         /// `sx1, sy1`.
         s: [f64; 2],
     },
+    /// Fisheye of COLMAP's `RAD_TAN_THIN_PRISM_FISHEYE` (Project Aria): six radial terms on the angle, then tangential and
+    /// thin-prism terms on the result.
+    RadTanThinPrism {
+        /// `k0 .. k5`.
+        k: [f64; 6],
+        /// `p0, p1`.
+        p: [f64; 2],
+        /// `s0 .. s3`.
+        s: [f64; 4],
+    },
     /// Devernay and Faugeras' one-parameter field-of-view model.
     FieldOfView {
         /// The model's angle, radians.
         omega: f64,
     },
+    /// Fitzgibbon's division model: the undistorted point is the distorted one over `1 + k r^2`.
+    Division {
+        /// `k`.
+        k: f64,
+    },
+    /// Khomutenko, Garcia and Martinet's enhanced unified model.
+    EnhancedUnified {
+        /// Share of the sphere, 0 to 1.
+        alpha: f64,
+        /// Weight of the radius, above 0.
+        beta: f64,
+    },
+    /// A panorama: x is the azimuth, y the angle below the horizon. Only what lies in front can become a pinhole's image.
+    Equirectangular,
 }
 
 impl Distortion {
@@ -40,12 +64,14 @@ impl Distortion {
         match *self {
             Self::None => true,
             Self::Radial { k, p } => k == [0.0; 6] && p == [0.0; 2],
-            Self::Fisheye { .. } => false,
+            Self::Fisheye { .. } | Self::RadTanThinPrism { .. } | Self::Equirectangular => false,
             Self::FieldOfView { omega } => omega == 0.0,
+            Self::Division { k } => k == 0.0,
+            Self::EnhancedUnified { alpha, .. } => alpha == 0.0,
         }
     }
 
-    /// Where the lens puts a point of the plane at depth 1.
+    /// Where the lens puts a point of the plane at depth 1; NaN where its model has no image of it.
     pub fn distort(&self, p_in_plane: &Point2<f64>) -> Point2<f64> {
         let (x, y) = (p_in_plane.x, p_in_plane.y);
         let r_sq = x * x + y * y;
@@ -60,10 +86,7 @@ impl Distortion {
                 )
             }
             Self::Fisheye { k, p, s } => {
-                let r = r_sq.sqrt();
-                let theta = r.atan();
-                let scale = if r > 1e-12 { theta / r } else { 1.0 };
-                let (u, v) = (x * scale, y * scale);
+                let (u, v) = fisheye(x, y);
                 let t_sq = u * u + v * v;
                 let radial = t_sq * (k[0] + t_sq * (k[1] + t_sq * (k[2] + t_sq * k[3])));
                 Point2::new(
@@ -79,6 +102,27 @@ impl Distortion {
                 let scale = (2.0 * r * (omega / 2.0).tan()).atan() / (omega * r);
                 Point2::new(x * scale, y * scale)
             }
+            Self::RadTanThinPrism { k, p, s } => {
+                let (u, v) = fisheye(x, y);
+                let t_sq = u * u + v * v;
+                let factor = 1.0 + k.iter().rev().fold(0.0, |sum, k| t_sq * (k + sum));
+                let (x, y) = (u * factor, v * factor);
+                let r_sq = x * x + y * y;
+                Point2::new(
+                    x + 2.0 * p[1] * x * y + p[0] * (r_sq + 2.0 * x * x) + r_sq * (s[0] + s[1] * r_sq),
+                    y + 2.0 * p[0] * x * y + p[1] * (r_sq + 2.0 * y * y) + r_sq * (s[2] + s[3] * r_sq),
+                )
+            }
+            Self::Division { k } => {
+                // The smaller root of k r^2 rho - r + rho = 0.
+                let scale = 2.0 / (1.0 + (1.0 - 4.0 * r_sq * k).sqrt());
+                Point2::new(x * scale, y * scale)
+            }
+            Self::EnhancedUnified { alpha, beta } => {
+                let scale = 1.0 / (alpha * (beta * r_sq + 1.0).sqrt() + 1.0 - alpha);
+                Point2::new(x * scale, y * scale)
+            }
+            Self::Equirectangular => Point2::new(x.atan(), (y / (x * x + 1.0).sqrt()).atan()),
         }
     }
 
@@ -88,6 +132,13 @@ impl Distortion {
         let further = self.distort(&Point2::from(p_in_plane.coords * 1.001)).coords;
         (further - here).dot(&p_in_plane.coords) >= 0.0 && here.dot(&p_in_plane.coords) >= 0.0
     }
+}
+
+/// The point at the same azimuth whose radius is the angle to the axis.
+fn fisheye(x: f64, y: f64) -> (f64, f64) {
+    let r = x.hypot(y);
+    let scale = if r > 1e-12 { r.atan() / r } else { 1.0 };
+    (x * scale, y * scale)
 }
 
 /// A photograph's camera as a source states it.
@@ -106,21 +157,36 @@ impl Lens {
     /// Bicubic (Catmull-Rom) interpolation.
     pub fn undistort(&self, photo: &RgbImage) -> (RgbImage, Mask) {
         let size = photo.size();
-        let k = self.intrinsics;
         let mut image = RgbImage::filled(size, [0; 3]);
         let mut valid = Mask::filled(size, false);
         for y in 0..size.height {
             for x in 0..size.width {
-                let ray = Point2::new((x as f64 - k.cx) / k.fx, (y as f64 - k.cy) / k.fy);
-                let bent = self.distortion.distort(&ray);
-                let source = Vector2::new(bent.x * k.fx + k.cx, bent.y * k.fy + k.cy);
-                if self.distortion.is_outward(&ray) && inside(&source, size) {
+                if let Some(source) = self.source_of(x, y, size) {
                     image[(x, y)] = bicubic(photo, source.x, source.y);
                     valid[(x, y)] = true;
                 }
             }
         }
         (image, valid)
+    }
+
+    /// The mask of [`Self::undistort`]'s photograph, from that of the photograph as it was taken; false where the lens did
+    /// not see. Nearest pixel.
+    pub fn undistort_mask(&self, mask: &Mask) -> Mask {
+        let size = mask.size();
+        Mask::from_fn(size, |x, y| {
+            let nearest = |p: Vector2<f64>| (p.x.round().max(0.0) as usize, p.y.round().max(0.0) as usize);
+            self.source_of(x, y, size).map(nearest).and_then(|(u, v)| mask.get(u, v).copied()).unwrap_or(false)
+        })
+    }
+
+    /// Where the photograph shows what belongs at this pixel of the undistorted one; `None` where the lens did not see it.
+    fn source_of(&self, x: usize, y: usize, size: ImageSize) -> Option<Vector2<f64>> {
+        let k = self.intrinsics;
+        let ray = Point2::new((x as f64 - k.cx) / k.fx, (y as f64 - k.cy) / k.fy);
+        let bent = self.distortion.distort(&ray);
+        let source = Vector2::new(bent.x * k.fx + k.cx, bent.y * k.fy + k.cy);
+        (self.distortion.is_outward(&ray) && inside(&source, size)).then_some(source)
     }
 }
 

@@ -11,15 +11,19 @@ mod export;
 mod import;
 mod keypoints;
 mod lens;
+mod manifest;
 mod matrix_txt;
 mod neus_cameras;
+mod photo_quality;
 pub mod pickle;
 mod pose_folder;
 mod sequence;
 mod visibility;
 
 pub use alignment::{Alignment, AlignmentStage, FrameAlignment};
-pub use check::{CheckOptions, CheckSummary, PhotoCheck, Problem, check};
+pub use check::{
+    CheckOptions, CheckSummary, HashCheck, Misreading, PhotoCheck, Problem, RotationCheck, check, check_pairs,
+};
 pub use export::{ExportFormat, ExportSummary, export};
 pub use import::{CaptureFormat, ImportOptions, ImportSummary, SkippedFrame, import};
 pub use keypoints::{Keypoint, Keypoints};

@@ -7,7 +7,8 @@ use mb_geometry::{Camera, Intrinsics, Rigid3, RotationDefect, World};
 use mb_job::{InputError, Result, write_atomic};
 use nalgebra::{DMatrix, Matrix3, Matrix4};
 
-fn read_matrix(path: &Path, size: usize) -> Result<DMatrix<f64>> {
+/// Reads a square matrix of numbers, which may be NaN or infinite.
+pub(crate) fn read_matrix_txt(path: &Path, size: usize) -> Result<DMatrix<f64>> {
     let bytes = std::fs::read(path).map_err(|e| InputError::unreadable(path, &e))?;
     let text = std::str::from_utf8(&bytes).map_err(|_| InputError::new(path, "not a text file"))?;
     let mut values = Vec::with_capacity(size * size);
@@ -50,7 +51,7 @@ fn write_matrix(path: &Path, matrix: &DMatrix<f64>) -> Result<()> {
 /// The file is missing, not 4x4 numbers, or not a rigid transform.
 pub fn read_pose_txt(path: impl AsRef<Path>) -> Result<(Rigid3<World, Camera>, RotationDefect)> {
     let path = path.as_ref();
-    let matrix: Matrix4<f64> = read_matrix(path, 4)?.fixed_view::<4, 4>(0, 0).into();
+    let matrix: Matrix4<f64> = read_matrix_txt(path, 4)?.fixed_view::<4, 4>(0, 0).into();
     Rigid3::from_matrix(&matrix).ok_or_else(|| {
         InputError::new(path, "not a rigid transform (rotation, translation in metres, last row 0 0 0 1)")
             .help("Poses are 4x4 camera-to-world matrices with OpenCV camera axes")
@@ -64,7 +65,7 @@ pub fn read_pose_txt(path: impl AsRef<Path>) -> Result<(Rigid3<World, Camera>, R
 /// The file is missing, not 3x3 numbers, or no pinhole camera (singular, skewed).
 pub fn read_intrinsics_txt(path: impl AsRef<Path>) -> Result<Intrinsics> {
     let path = path.as_ref();
-    let matrix: Matrix3<f64> = read_matrix(path, 3)?.fixed_view::<3, 3>(0, 0).into();
+    let matrix: Matrix3<f64> = read_matrix_txt(path, 3)?.fixed_view::<3, 3>(0, 0).into();
     Intrinsics::from_matrix(&matrix).map_err(|e| InputError::new(path, e.to_string()).into())
 }
 

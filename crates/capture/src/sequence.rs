@@ -1,6 +1,6 @@
 //! A sequence folder.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::{Path, PathBuf};
 
@@ -54,6 +54,9 @@ pub struct SequenceMeta {
     /// Time of each frame in seconds from the first, in the order of the frame numbers; `None` where unknown.
     #[serde(default)]
     pub frame_times_s: Option<Vec<f64>>,
+    /// SHA-256 of the files that the capture consists of, by their path in the folder; `None` where nobody took them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hashes_sha256: Option<BTreeMap<String, String>>,
     /// Seed, options and versions of the program that wrote the sequence.
     #[serde(default)]
     pub provenance: serde_json::Value,

@@ -121,12 +121,24 @@ fn stray_rows_are_joined_by_frame_number_and_keep_their_own_intrinsics() {
 }
 
 #[test]
+fn a_camera_path_alone_comes_in_and_says_so() {
+    let Some(source) = mb_testdata::find("stray_scanner_excerpt") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let summary = import_all(&source, &dir.path().join("seq")).unwrap();
+    assert_eq!((summary.frames_imported, summary.frames_with_pose, summary.frames_with_depth), (4, 4, 0));
+    assert!(summary.warnings.iter().any(|w| w.contains("only the camera path")), "{:?}", summary.warnings);
+    let sequence = Sequence::open(dir.path().join("seq")).unwrap();
+    assert_eq!(sequence.frames().iter().map(|f| f.id.0).collect::<Vec<_>>(), [0, 1031, 1758, 2062]);
+    assert!(sequence.frames().iter().all(|f| f.image.is_none()));
+}
+
+#[test]
 fn record3d_metadata_alone_says_what_is_missing() {
     let Some(source) = mb_testdata::find("record3d_metadata_r3d/data.r3d") else { return };
     assert_eq!(CaptureFormat::detect(&source), Some(CaptureFormat::Record3d));
     let dir = tempfile::tempdir().unwrap();
     let message = input_error(import_all(&source, &dir.path().join("seq")));
-    assert!(message.contains("data.r3d") && message.contains("rgbd/ has no photograph"), "{message}");
+    assert!(message.contains("data.r3d") && message.contains("no photograph of it in rgbd/"), "{message}");
     assert!(!dir.path().join("seq").exists());
 }
 
@@ -174,7 +186,7 @@ fn a_record3d_archive_with_lzfse_depth_comes_in_metric() {
     assert!((read[(3, 2)] - 0.55).abs() < 6e-4);
     // Depth of another size than stated.
     let message = input_error(import_all(&write("b.r3d", &depth[..100]), &dir.path().join("b")));
-    assert!(message.contains("rgbd/0.depth") && message.contains("expected 192"), "{message}");
+    assert!(message.contains("rgbd/0.depth") && message.contains("expected 48 (6x8)"), "{message}");
 }
 
 #[test]

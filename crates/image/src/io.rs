@@ -150,6 +150,12 @@ pub fn read_depth_png_mm(path: impl AsRef<Path>) -> Result<Image<u16>> {
     }
 }
 
+/// Whether a file is an image of 16-bit grey, as depth maps are, by its header alone.
+pub fn is_grey16(path: impl AsRef<Path>) -> bool {
+    let decoder = open(path.as_ref()).ok().and_then(|reader| reader.into_decoder().ok());
+    decoder.is_some_and(|decoder| image::ImageDecoder::color_type(&decoder) == ColorType::L16)
+}
+
 /// Reads a LiDAR confidence map: an 8-bit grey PNG with the values 0, 1, 2.
 ///
 /// # Errors

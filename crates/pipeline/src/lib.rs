@@ -4,15 +4,20 @@
 //! Each stage reads and writes documented files, so any of them can be rerun or replaced alone; this crate only
 //! puts them in order.
 
+mod capture_check;
 mod demo;
+mod frame_pictures;
 mod leaderboard;
 mod model_capture;
 mod pictures;
 mod report;
 mod scene_report;
 
+pub use capture_check::{
+    CaptureCheck, CaptureCheckOptions, EpipolarCheck, EpipolarOptions, EpipolarPair, check_capture, check_report,
+};
 pub use demo::{DemoOptions, DemoSummary, demo};
 pub use leaderboard::{LeaderboardOptions, LeaderboardSummary, leaderboard};
 pub use model_capture::{ModelCapture, simulate_model};
-pub use report::{ColorScale, Curves, Gallery, Picture, Report, Stage, Table};
+pub use report::{ColorScale, Curves, Drawings, Gallery, Picture, Report, Stage, Table};
 pub use scene_report::{Scored, scene_report};

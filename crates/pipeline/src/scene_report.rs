@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use mb_capture::{Frame, Sequence};
+use mb_capture::Sequence;
 use mb_eval::{SurfaceProtocol, SurfaceScores, SurfaceTruth};
 use mb_geometry::ImageSize;
 use mb_image::{DepthImage, RgbImage};
@@ -13,6 +13,7 @@ use mb_render::{heat_colors, overlay_edges};
 use mb_truth::ExactScene;
 use nalgebra::Vector3;
 
+use crate::frame_pictures::{enlarged, spread, turns_to_upright};
 use crate::pictures::{HEAT_LIMIT_MM, Studio, heated};
 use crate::report::{ColorScale, Curves, Gallery, Picture, Report, Table};
 
@@ -122,23 +123,6 @@ fn score_curves(method: &Scored) -> Vec<Curves> {
     method.scores.iter().map(curve).collect()
 }
 
-/// Frames spread over the sequence that have a photograph.
-fn spread(frames: &[Frame], count: usize) -> Vec<&Frame> {
-    let with_image: Vec<&Frame> = frames.iter().filter(|f| f.image.is_some()).collect();
-    (0..count.min(with_image.len())).map(|i| with_image[i * with_image.len() / count.min(with_image.len())]).collect()
-}
-
-/// Clockwise quarter turns that bring the world's up to the top of a frame's picture.
-fn turns_to_upright(frame: &Frame, up_in_world: &Vector3<f64>) -> usize {
-    let up_in_cam = frame.world_from_cam.inverse().rotate(up_in_world);
-    match (up_in_cam.x.abs() > up_in_cam.y.abs(), up_in_cam.x > 0.0, up_in_cam.y > 0.0) {
-        (true, false, _) => 1,
-        (false, _, true) => 2,
-        (true, true, _) => 3,
-        (false, _, false) => 0,
-    }
-}
-
 fn alignment_gallery(sequence: &Sequence, exact: &ExactScene, up: &Vector3<f64>) -> Result<Gallery> {
     let pictures = spread(&exact.frames, 4)
         .into_iter()
@@ -205,12 +189,6 @@ fn depth_gallery(sequence: &Sequence, exact: &ExactScene, up: &Vector3<f64>) -> 
 fn color_scale(limit_mm: f64) -> ColorScale {
     let values: Vec<f64> = (0..=16).map(|i| f64::from(i) / 16.0).collect();
     ColorScale { colors: heat_colors(&values, 0.0, 1.0), largest: format!("{limit_mm} mm") }
-}
-
-/// A depth map at the photograph's size, each pixel the nearest of its own.
-fn enlarged(depth: &DepthImage, size: ImageSize) -> DepthImage {
-    let at = |i: usize, to: usize, from: usize| ((2 * i + 1) * to / (2 * from)).min(to - 1);
-    DepthImage::from_fn(size, |x, y| depth[(at(x, depth.width(), size.width), at(y, depth.height(), size.height))])
 }
 
 fn error_galleries(

@@ -220,6 +220,7 @@ pub fn simulate(
         device: "simulated phone".to_owned(),
         source: "mobilebrick capture simulate".to_owned(),
         frame_times_s: Some(times),
+        hashes_sha256: None,
         provenance: serde_json::to_value(&plan).expect("plain data with string keys"),
     };
     write_atomic(out.join("sequence.json"), &to_json(&meta))?;

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 use mb_capture::{CaptureFormat, ExportFormat, ImportOptions};
+use mb_download::DownloadOptions;
 use mb_geometry::ImageSize;
 use mb_job::Result;
 use mb_pipeline::{ModelCapture, simulate_model};
@@ -25,6 +26,8 @@ pub enum Capture {
     Check(Check),
     /// Write a sequence in the layout of another program
     Export(Export),
+    /// Fetch the published data set, or parts of it; a stopped run is taken up again
+    Download(Download),
 }
 
 impl Capture {
@@ -35,6 +38,7 @@ impl Capture {
             Self::Simulate(c) => c.run(terminal),
             Self::Check(c) => c.run(terminal),
             Self::Export(c) => c.run(terminal),
+            Self::Download(c) => c.run(terminal),
         }
     }
 }
@@ -131,6 +135,10 @@ enum ImportFormat {
     Arkitscenes,
     Nerfstudio,
     Colmap,
+    SevenScenes,
+    Neus,
+    Mvsnet,
+    Opensfm,
     Photos,
 }
 
@@ -144,6 +152,10 @@ impl From<ImportFormat> for CaptureFormat {
             ImportFormat::Arkitscenes => Self::Arkitscenes,
             ImportFormat::Nerfstudio => Self::Nerfstudio,
             ImportFormat::Colmap => Self::Colmap,
+            ImportFormat::SevenScenes => Self::SevenScenes,
+            ImportFormat::Neus => Self::Neus,
+            ImportFormat::Mvsnet => Self::Mvsnet,
+            ImportFormat::Opensfm => Self::Opensfm,
             ImportFormat::Photos => Self::Photos,
         }
     }
@@ -165,23 +177,33 @@ pub struct Import {
     out: PathBuf,
 
     /// Take every N-th frame
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    every: usize,
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    every: u32,
 
-    /// First and last frame number to take
-    #[arg(long, value_name = "FIRST-LAST", value_parser = parse_range)]
+    /// First and last frame number to take, such as 10..99
+    #[arg(long, value_name = "FIRST..LAST", value_parser = parse_range)]
     range: Option<(u32, u32)>,
+
+    /// Keep K frames: the sharpest of each of K runs of equal length, which drops blurred ones
+    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u32).range(1..))]
+    sharpest: Option<u32>,
 }
 
 impl Import {
     fn run(&self, terminal: &Terminal) -> Result<Outcome> {
-        let options = ImportOptions { range: self.range, every: self.every };
+        let options = ImportOptions {
+            range: self.range,
+            every: self.every as usize,
+            sharpest: self.sharpest.map(|k| k as usize),
+        };
         let summary = mb_capture::import(&self.source, self.format.map(Into::into), &self.out, &options, terminal)?;
         let mut text = format!(
-            "read {}: {} of {} frames, {} with depth, {} with a pose; wrote {}\n",
+            "read {}: {} of {} frames ({} not asked for, {} left out), {} with depth, {} with a pose; wrote {}\n",
             summary.format.name(),
             summary.frames_imported,
             summary.frames_found,
+            summary.frames_not_selected,
+            summary.frames_skipped.len(),
             summary.frames_with_depth,
             summary.frames_with_pose,
             self.out.display()
@@ -198,11 +220,17 @@ impl Import {
 pub struct Check {
     #[command(flatten)]
     sequence: SequenceArgument,
+
+    /// Also write a page with the camera path, photographs and depth
+    #[arg(long, value_name = "FILE.html")]
+    report: Option<PathBuf>,
 }
 
 impl Check {
     fn run(&self, terminal: &Terminal) -> Result<Outcome> {
-        let summary = mb_capture::check(&self.sequence.open()?, &Default::default(), terminal)?;
+        let sequence = self.sequence.open()?;
+        let check = mb_pipeline::check_capture(&sequence, &Default::default(), terminal)?;
+        let summary = &check.capture;
         let mut text = format!(
             "{} frames, {} photographs, {} depth maps, {:.0} % of the way round: {}\n",
             summary.frames,
@@ -211,11 +239,22 @@ impl Check {
             summary.orbit_coverage * 100.0,
             if summary.ok { "nothing wrong".to_owned() } else { format!("{} problems", summary.problems.len()) }
         );
+        if let Some(mm) = summary.depth_disagreement_mm {
+            text += &format!("depth and poses disagree by {mm:.1} mm\n");
+        }
+        if let Some(epipolar) = &check.epipolar {
+            let (px, pairs) = (epipolar.median_px, epipolar.pairs.len());
+            text += &format!("matches lie {px:.2} px from where the poses put them ({pairs} pairs of photographs)\n");
+        }
         for problem in &summary.problems {
             let place = problem.frame.map(|frame| format!("frame {frame}: ")).unwrap_or_default();
             text += &format!("{}: {place}{}\n", problem.kind, problem.message);
         }
-        Outcome::new(&summary, text)
+        if let Some(path) = &self.report {
+            mb_pipeline::check_report(&sequence, &check, terminal)?.write(path)?;
+            text += &format!("wrote {}\n", path.display());
+        }
+        Outcome::new(&check, text)
     }
 }
 
@@ -257,7 +296,45 @@ impl Export {
     }
 }
 
+/// Fetch the published data set, or parts of it; a stopped run is taken up again
+#[derive(Debug, Args)]
+pub struct Download {
+    /// A folder of the archive: a sequence (aston), a kind of file (mesh), or both (aston/mesh); may be repeated
+    #[arg(long = "part", value_name = "NAME")]
+    parts: Vec<String>,
+
+    /// Address of another zip archive, or the path of one that is here already
+    #[arg(long, value_name = "URL", default_value = mb_download::PUBLISHED_URL)]
+    url: String,
+
+    /// Folder to write, where files lie as in the archive
+    #[arg(short, long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+impl Download {
+    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
+        let options = DownloadOptions { url: self.url.clone(), parts: self.parts.clone(), ..Default::default() };
+        let summary = mb_download::download(&self.out, &options, terminal)?;
+        let mut text = format!(
+            "wrote {}: {} files, {} were there already; {:.1} MB in all, every file checked\n",
+            self.out.display(),
+            summary.files_written,
+            summary.files_kept,
+            summary.bytes as f64 * 1e-6
+        );
+        if let Some(archive) = &summary.archive {
+            text += &format!(
+                "the server sends only the whole archive; it is kept as {} (--url takes its path)\n",
+                archive.display()
+            );
+        }
+        Outcome::new(&summary, text)
+    }
+}
+
 fn parse_range(text: &str) -> Result<(u32, u32), String> {
-    let ends = text.split_once('-').and_then(|(a, b)| Some((a.parse().ok()?, b.parse().ok()?)));
-    ends.filter(|(first, last)| first <= last).ok_or_else(|| "must look like 10-99".to_owned())
+    let halves = text.split_once("..").or_else(|| text.split_once('-'));
+    let ends = halves.and_then(|(a, b)| Some((a.trim().parse().ok()?, b.trim().parse().ok()?)));
+    ends.filter(|(first, last)| first <= last).ok_or_else(|| "must look like 10..99, both included".to_owned())
 }

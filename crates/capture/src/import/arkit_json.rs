@@ -74,6 +74,7 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
             lens_size: None,
             world_from_cam: Some(world_from_cam),
             depth: depth.exists().then(|| Depth::Png(depth, confidence.exists().then_some(confidence))),
+            mask: None,
             time_s: json::number(&value, "time"),
         });
     }

@@ -107,6 +107,7 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
             lens_size: None,
             world_from_cam: Some(world_from_cam),
             depth: beside("lowres_depth").map(|depth| Depth::Png(depth, beside("confidence"))),
+            mask: None,
             time_s: Some(time_s),
         });
     }

@@ -1,8 +1,8 @@
 //! A COLMAP model, text or binary, with its photographs.
 //!
 //! The model lies in the source itself or in one of the places where COLMAP and its users put it; photographs in
-//! `images/` or `image/` beside or above it. Every camera model that COLMAP has is undistorted to a pinhole, but for
-//! `RAD_TAN_THIN_PRISM_FISHEYE`. The scale is arbitrary.
+//! `images/` or `image/` beside or above it, masks in `masks/NAME.png` beside the photographs' folder. Every camera model
+//! that COLMAP has is undistorted to a pinhole. The scale is arbitrary.
 
 use std::path::{Path, PathBuf};
 
@@ -46,6 +46,11 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
             lens_size: Some(camera.size),
             world_from_cam: Some(image.cam_from_world.inverse()),
             depth: None,
+            // As COLMAP's feature extractor names them.
+            mask: places
+                .iter()
+                .map(|place| place.with_file_name("masks").join(format!("{}.png", image.name)))
+                .find(|p| p.is_file()),
             time_s: None,
         });
     }

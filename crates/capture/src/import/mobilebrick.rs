@@ -49,6 +49,7 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
             lens_size: None,
             world_from_cam: Some(world_from_cam),
             depth: find(&depths, id).map(|depth| Depth::Png(depth, confidence.exists().then_some(confidence))),
+            mask: Some(source.join("mask").join(format!("{id}.png"))).filter(|p| p.is_file()),
             time_s: None,
         });
     }

@@ -12,9 +12,15 @@ mod axes;
 mod colmap;
 mod json;
 mod mobilebrick;
+mod mvsnet;
+mod neus;
+mod npy;
+mod opensfm;
 mod photos;
 mod record3d;
 mod recording;
+mod seven_scenes;
+mod staging;
 mod stray;
 mod transforms;
 mod video;
@@ -47,20 +53,32 @@ pub enum CaptureFormat {
     Nerfstudio,
     /// A COLMAP model, text or binary, with its photographs.
     Colmap,
+    /// 7-Scenes and tsdf-fusion-python: `frame-NNNNNN.color.jpg`, `.depth.png`, `.pose.txt`.
+    SevenScenes,
+    /// NeuS: `cameras_sphere.npz` with photographs and masks by number.
+    Neus,
+    /// MVSNet: `cams/NNNNNNNN_cam.txt` with photographs by number.
+    Mvsnet,
+    /// OpenSfM: `reconstruction.json` with its photographs.
+    Opensfm,
     /// A folder of photographs, without cameras.
     Photos,
 }
 
 impl CaptureFormat {
     /// Every format, in the order in which a source is tried.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 12] = [
         Self::Mobilebrick,
         Self::Record3d,
         Self::Stray,
         Self::ArkitJson,
         Self::Arkitscenes,
+        Self::SevenScenes,
         Self::Nerfstudio,
         Self::Colmap,
+        Self::Neus,
+        Self::Mvsnet,
+        Self::Opensfm,
         Self::Photos,
     ];
 
@@ -74,6 +92,10 @@ impl CaptureFormat {
             Self::Arkitscenes => "arkitscenes",
             Self::Nerfstudio => "nerfstudio",
             Self::Colmap => "colmap",
+            Self::SevenScenes => "seven-scenes",
+            Self::Neus => "neus",
+            Self::Mvsnet => "mvsnet",
+            Self::Opensfm => "opensfm",
             Self::Photos => "photos",
         }
     }
@@ -88,6 +110,10 @@ impl CaptureFormat {
             Self::Arkitscenes => arkit_scenes::looks_like(source),
             Self::Nerfstudio => transforms::looks_like(source),
             Self::Colmap => colmap::looks_like(source),
+            Self::SevenScenes => seven_scenes::looks_like(source),
+            Self::Neus => neus::looks_like(source),
+            Self::Mvsnet => mvsnet::looks_like(source),
+            Self::Opensfm => opensfm::looks_like(source),
             Self::Photos => photos::looks_like(source),
         })
     }
@@ -101,6 +127,10 @@ impl CaptureFormat {
             Self::Arkitscenes => arkit_scenes::read(source),
             Self::Nerfstudio => transforms::read(source),
             Self::Colmap => colmap::read(source),
+            Self::SevenScenes => seven_scenes::read(source),
+            Self::Neus => neus::read(source),
+            Self::Mvsnet => mvsnet::read(source),
+            Self::Opensfm => opensfm::read(source),
             Self::Photos => photos::read(source),
         }
     }
@@ -114,11 +144,14 @@ pub struct ImportOptions {
     pub range: Option<(u32, u32)>,
     /// Take every n-th frame of those.
     pub every: usize,
+    /// Of those, keep this many: they are divided into that many runs of equal length, and the sharpest photograph of each
+    /// is taken. `None` keeps all.
+    pub sharpest: Option<usize>,
 }
 
 impl Default for ImportOptions {
     fn default() -> Self {
-        Self { range: None, every: 1 }
+        Self { range: None, every: 1, sharpest: None }
     }
 }
 
@@ -131,11 +164,15 @@ pub struct ImportSummary {
     pub frames_found: usize,
     /// Frames in the sequence.
     pub frames_imported: usize,
+    /// Frames that the options left out; found = imported + not selected + skipped.
+    pub frames_not_selected: usize,
     /// Of these, how many have the phone's depth.
     pub frames_with_depth: usize,
     /// Of these, how many have a camera pose.
     pub frames_with_pose: usize,
-    /// Frames that were left out, with the reason.
+    /// Of these, how many have a mask of the object.
+    pub frames_with_mask: usize,
+    /// Frames that cannot be used, with the reason.
     pub frames_skipped: Vec<SkippedFrame>,
     /// Size of the photographs.
     pub image_size: ImageSize,

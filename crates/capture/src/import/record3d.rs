@@ -1,7 +1,9 @@
-//! Record3D: an `.r3d` archive (a zip) with `metadata` and `rgbd/N.jpg`, `rgbd/N.depth`, `rgbd/N.conf`.
+//! Record3D: an `.r3d` archive (a zip) with `metadata` and `rgbd/N.jpg`, `rgbd/N.depth`, `rgbd/N.conf`; the folder that it
+//! unpacks to; or the "EXR + JPG" export, a folder with `metadata.json`, `rgb/N.jpg` and `depth/N.exr`.
 //!
 //! `K` is column-major; newer files have `perFrameIntrinsicCoeffs` (fx fy cx cy). Poses are qx qy qz qw tx ty tz,
-//! camera-to-world with OpenGL camera axes of the portrait photograph. Depth is LZFSE-compressed f32 metres.
+//! camera-to-world with OpenGL camera axes of the photograph, which is portrait. Depth is LZFSE-compressed f32 metres, or
+//! half or single floats in an OpenEXR channel.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -15,23 +17,41 @@ use crate::FrameId;
 use crate::lens::{Distortion, Lens};
 
 use super::archive::Archive;
-use super::recording::{Depth, Photo, RecordedFrame, Recording};
+use super::recording::{Depth, DepthSize, Photo, RecordedFrame, Recording};
 use super::{axes, json};
 
+/// Where the app puts its description: in `.r3d`, and in the EXR export.
+const DESCRIPTIONS: [&str; 2] = ["metadata", "metadata.json"];
+
+/// The source itself, or the folder `EXR_RGBD` that the export makes in it.
+fn root(source: &Path) -> std::path::PathBuf {
+    let inner = source.join("EXR_RGBD");
+    if inner.is_dir() { inner } else { source.to_owned() }
+}
+
+fn description(archive: &Archive) -> Option<&'static str> {
+    DESCRIPTIONS.into_iter().find(|name| archive.contains(name))
+}
+
 pub(super) fn looks_like(source: &Path) -> bool {
-    source.is_file() && Archive::open(source).is_ok_and(|archive| archive.contains("metadata"))
+    let Ok(archive) = Archive::open(&root(source)) else { return false };
+    let Some(name) = description(&archive) else { return false };
+    // Many programs write a metadata.json.
+    let has_keys = |value: Value| value.get("poses").is_some() && value.get("K").is_some();
+    name == "metadata" || archive.read(name).is_ok_and(|b| serde_json::from_slice(&b).is_ok_and(has_keys))
 }
 
 pub(super) fn read(source: &Path) -> Result<Recording> {
+    let source = &root(source);
     let archive = Arc::new(Archive::open(source)?);
-    if !archive.contains("metadata") {
-        return Err(InputError::new(source, "the archive has no entry 'metadata'")
-            .help("Share the recording from Record3D as '.r3d'")
+    let Some(place) = description(&archive) else {
+        return Err(InputError::new(source, "has no 'metadata'")
+            .help("Share the recording from Record3D as '.r3d', or export it as 'EXR + JPG sequence'")
             .into());
-    }
-    let metadata: Value = serde_json::from_slice(&archive.read("metadata")?)
-        .map_err(|e| InputError::new(source, e.to_string()).at("metadata"))?;
-    let bad = |found: String| InputError::new(source, found).at("metadata");
+    };
+    let metadata: Value =
+        serde_json::from_slice(&archive.read(place)?).map_err(|e| InputError::new(source, e.to_string()).at(place))?;
+    let bad = |found: String| InputError::new(source, found).at(place);
     let dimension =
         |key: &str| json::number(&metadata, key).filter(|v| *v >= 1.0 && *v <= 20_000.0).map(|v| v as usize);
     let size = match (dimension("w"), dimension("h")) {
@@ -47,10 +67,10 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
         .get("poses")
         .and_then(Value::as_array)
         .ok_or_else(|| bad("'poses' is missing; this recording has no camera path".to_owned()))?;
-    // Older files do not state the size of their depth maps, which was 192x256.
+    // Older files do not state the size of their depth maps (LiDAR 192x256, front camera 480x640).
     let depth_size = match (dimension("dw"), dimension("dh")) {
-        (Some(w), Some(h)) => ImageSize::new(w, h),
-        _ => ImageSize::new(192, 256),
+        (Some(w), Some(h)) => DepthSize::Stated(ImageSize::new(w, h)),
+        _ => DepthSize::LikePhoto(size),
     };
 
     let mut recording = Recording::new("iPhone (Record3D)", true);
@@ -78,24 +98,29 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
         if !(intrinsics.fx > 0.0 && intrinsics.fy > 0.0) {
             return Err(bad(format!("frame {i}: a focal length is not above 0")).into());
         }
-        let photo = ["jpg", "png"].map(|e| format!("rgbd/{i}.{e}")).into_iter().find(|name| archive.contains(name));
+        let photo = [("rgbd", "jpg"), ("rgbd", "png"), ("rgb", "jpg"), ("rgb", "png")]
+            .map(|(folder, extension)| format!("{folder}/{i}.{extension}"))
+            .into_iter()
+            .find(|name| archive.contains(name));
         let Some(photo) = photo else {
-            recording.skip(i.to_string(), "rgbd/ has no photograph of it");
+            recording.skip(i.to_string(), "there is no photograph of it in rgbd/ or rgb/");
             continue;
         };
-        let (depth, confidence) = (format!("rgbd/{i}.depth"), format!("rgbd/{i}.conf"));
+        let (depth, confidence, exr) = (format!("rgbd/{i}.depth"), format!("rgbd/{i}.conf"), format!("depth/{i}.exr"));
+        let depth = if archive.contains(&depth) {
+            let confidence = archive.contains(&confidence).then_some(confidence);
+            Some(Depth::Lzfse { archive: archive.clone(), depth, confidence, size: depth_size })
+        } else {
+            archive.contains(&exr).then(|| Depth::Exr(archive.clone(), exr))
+        };
         recording.frames.push(RecordedFrame {
             id: FrameId(i as u32),
             photo: Some(Photo::Entry(archive.clone(), photo)),
             lens: Some(Lens { intrinsics, distortion: Distortion::None }),
             lens_size: Some(size),
             world_from_cam: Some(world_from_cam),
-            depth: archive.contains(&depth).then(|| Depth::Lzfse {
-                archive: archive.clone(),
-                confidence: archive.contains(&confidence).then_some(confidence),
-                depth,
-                size: depth_size,
-            }),
+            depth,
+            mask: None,
             time_s: times.and_then(|t| t.get(i)?.as_f64()).or(fps.map(|fps| i as f64 / fps)),
         });
     }

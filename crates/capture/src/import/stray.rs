@@ -2,9 +2,10 @@
 //!
 //! Rows of the odometry are joined with files by their frame number, never by position. The quaternion (x y z w) is
 //! already camera-to-world with OpenCV axes. New recordings state intrinsics in every row; `camera_matrix.csv` is only
-//! the last frame's, and serves where rows have none.
+//! the last frame's, and serves where rows have none. The first versions of the app wrote neither a header nor frame numbers
+//! (x, y, z, qx, qy, qz, qw, a row a frame), and depth as `.npy` arrays in millimetres.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use mb_geometry::{Intrinsics, Rigid3};
 use mb_job::{InputError, Result};
@@ -36,27 +37,52 @@ fn camera_matrix(path: &Path) -> Result<Intrinsics> {
     Ok(Intrinsics::from_matrix(&Matrix3::from_row_slice(&words)).map_err(|e| InputError::new(path, e.to_string()))?)
 }
 
+/// Which column of `odometry.csv` holds what.
+struct Columns {
+    pose: [usize; 7],
+    /// `None` where rows are frames in order.
+    frame: Option<usize>,
+    time: Option<usize>,
+    intrinsics: [Option<usize>; 4],
+}
+
+impl Columns {
+    /// From the first line, which is a header unless it is a row of seven numbers.
+    fn of(first: &str, path: &Path) -> Result<(Self, bool)> {
+        let words: Vec<&str> = first.split(',').map(str::trim).collect();
+        if words.len() == 7 && words.iter().all(|w| w.parse::<f64>().is_ok()) {
+            return Ok((Self { pose: [0, 1, 2, 3, 4, 5, 6], frame: None, time: None, intrinsics: [None; 4] }, false));
+        }
+        let column = |name: &str| words.iter().position(|c| *c == name);
+        let need = |name: &str| {
+            column(name).ok_or_else(|| InputError::new(path, format!("has no column '{name}'")).at_line(1))
+        };
+        let columns = Self {
+            pose: [need("x")?, need("y")?, need("z")?, need("qx")?, need("qy")?, need("qz")?, need("qw")?],
+            frame: Some(need("frame")?),
+            time: Some(need("timestamp")?),
+            intrinsics: ["fx", "fy", "cx", "cy"].map(column),
+        };
+        Ok((columns, true))
+    }
+}
+
+/// The first of these files that exists.
+fn first_file(candidates: impl IntoIterator<Item = PathBuf>) -> Option<PathBuf> {
+    candidates.into_iter().find(|p| p.is_file())
+}
+
 pub(super) fn read(source: &Path) -> Result<Recording> {
     let path = source.join("odometry.csv");
     let text = read_text(&path)?;
-    let mut lines = text.lines().enumerate();
-    let (_, header) = lines.next().ok_or_else(|| InputError::new(&path, "is empty"))?;
-    let columns: Vec<&str> = header.split(',').map(str::trim).collect();
-    let column = |name: &str| columns.iter().position(|c| *c == name);
-    let need =
-        |name: &str| column(name).ok_or_else(|| InputError::new(&path, format!("has no column '{name}'")).at_line(1));
-    let pose_columns = [need("x")?, need("y")?, need("z")?, need("qx")?, need("qy")?, need("qz")?, need("qw")?];
-    let (time_column, frame_column) = (need("timestamp")?, need("frame")?);
-    let k_columns = [column("fx"), column("fy"), column("cx"), column("cy")];
-
+    let (columns, has_header) = Columns::of(text.lines().next().unwrap_or_default(), &path)?;
     let video = source.join("rgb.mp4");
+    let has_video = video.is_file();
     let fallback = source.join("camera_matrix.csv");
     let mut shared = None;
     let mut recording = Recording::new("iPhone (Stray Scanner)", true);
-    for (i, line) in lines {
-        if line.trim().is_empty() {
-            continue;
-        }
+    let rows = text.lines().enumerate().skip(usize::from(has_header)).filter(|(_, line)| !line.trim().is_empty());
+    for (row, (i, line)) in rows.enumerate() {
         let words: Vec<&str> = line.split(',').map(str::trim).collect();
         let value = |at: usize| -> Result<f64> {
             let word = words.get(at).copied().unwrap_or("");
@@ -65,12 +91,16 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
                 InputError::new(&path, format!("column {}: '{word}' is no number", at + 1)).at_line(i + 1)
             })?)
         };
-        let frame = words.get(frame_column).copied().unwrap_or("");
-        let id: u32 = frame
-            .parse()
-            .map_err(|_| InputError::new(&path, format!("frame '{frame}' is no number")).at_line(i + 1))?;
+        let id: u32 = match columns.frame {
+            None => row as u32,
+            Some(column) => {
+                let frame = words.get(column).copied().unwrap_or("");
+                let bad = || InputError::new(&path, format!("frame '{frame}' is no number")).at_line(i + 1);
+                frame.parse().map_err(|_| bad())?
+            }
+        };
         let mut pose = [0.0; 7];
-        for (to, at) in pose.iter_mut().zip(pose_columns) {
+        for (to, at) in pose.iter_mut().zip(columns.pose) {
             *to = value(at)?;
         }
         let [x, y, z, qx, qy, qz, qw] = pose;
@@ -79,7 +109,8 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
             let found = format!("the quaternion has norm {:.4}, not 1", quaternion.norm());
             return Err(InputError::new(&path, found).at_line(i + 1).into());
         }
-        let own = k_columns
+        let own = columns
+            .intrinsics
             .iter()
             .map(|c| c.filter(|c| words.get(*c).is_some_and(|w| !w.is_empty())))
             .collect::<Option<Vec<_>>>();
@@ -96,15 +127,19 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
                 None => *shared.insert(camera_matrix(&fallback)?),
             },
         };
-        let file = |folder: &str| source.join(folder).join(format!("{id:06}.png"));
-        let (depth, confidence) = (file("depth"), file("confidence"));
-        let photo =
-            ["jpg", "png"].map(|e| source.join("rgb").join(format!("{id:06}.{e}"))).into_iter().find(|p| p.exists());
+        let file = |folder: &str, extensions: [&str; 2]| {
+            first_file(extensions.map(|e| source.join(folder).join(format!("{id:06}.{e}"))))
+        };
+        let confidence = file("confidence", ["png", "npy"]);
+        let depth = file("depth", ["png", "npy"]).map(|depth| match depth.extension() {
+            Some(e) if e == "npy" => Depth::Npy(depth, confidence),
+            _ => Depth::Png(depth, confidence),
+        });
         recording.frames.push(RecordedFrame {
             id: FrameId(id),
-            photo: match photo {
+            photo: match file("rgb", ["jpg", "png"]) {
                 Some(photo) => Some(Photo::File(photo)),
-                None => video.exists().then(|| Photo::Video(video.clone(), id as usize)),
+                None => has_video.then(|| Photo::Video(video.clone(), id as usize)),
             },
             lens: Some(Lens { intrinsics, distortion: Distortion::None }),
             lens_size: None,
@@ -112,9 +147,13 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
                 UnitQuaternion::from_quaternion(quaternion),
                 Vector3::new(x, y, z),
             )),
-            depth: depth.exists().then(|| Depth::Png(depth, confidence.exists().then_some(confidence))),
-            time_s: Some(value(time_column)?),
+            depth,
+            mask: None,
+            time_s: columns.time.map(value).transpose()?,
         });
+    }
+    if recording.frames.is_empty() {
+        return Err(InputError::new(&path, "has no rows").into());
     }
     if shared.is_some() {
         recording.warnings.push(
@@ -122,7 +161,7 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
                 .to_owned(),
         );
     }
-    if !video.exists() && recording.frames.iter().all(|f| f.photo.is_none()) {
+    if !has_video && recording.frames.iter().all(|f| f.photo.is_none()) {
         recording.warnings.push("rgb.mp4 is absent, so there are no photographs".to_owned());
     }
     recording.frames.sort_by_key(|f| f.id);

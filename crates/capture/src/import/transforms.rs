@@ -103,18 +103,18 @@ pub(super) fn read(source: &Path) -> Result<Recording> {
             _ => mb_image::read_size(&photo)?,
         };
         let lens = lens(&top, frame, size).map_err(|found| InputError::new(&path, found).at(place()))?;
-        let depth = frame
-            .get("depth_file_path")
-            .and_then(Value::as_str)
-            .map(|depth| folder.join(depth))
-            .filter(|depth| depth.extension().is_some_and(|e| e == "png") && depth.is_file());
+        let png = |key: &str| {
+            let path = folder.join(frame.get(key).and_then(Value::as_str)?);
+            (path.extension().is_some_and(|e| e == "png") && path.is_file()).then_some(path)
+        };
         recording.frames.push(RecordedFrame {
             id,
             photo: Some(Photo::File(photo)),
             lens: Some(lens),
             lens_size: Some(size),
             world_from_cam: Some(world_from_cam),
-            depth: depth.map(|depth| Depth::Png(depth, None)),
+            depth: png("depth_file_path").map(|depth| Depth::Png(depth, None)),
+            mask: png("mask_path"),
             time_s: None,
         });
     }

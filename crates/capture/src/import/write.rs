@@ -6,10 +6,14 @@ use mb_geometry::{ImageSize, Intrinsics};
 use mb_image::RgbImage;
 use mb_job::{Error, InputError, Progress, Result, Steps, write_atomic};
 
+use crate::lens::Lens;
+use crate::manifest::file_hashes;
+use crate::photo_quality::PhotoQuality;
 use crate::sequence::write_json;
-use crate::{SequenceMeta, write_intrinsics_txt, write_pose_txt};
+use crate::{FrameId, SequenceMeta, write_intrinsics_txt, write_pose_txt};
 
 use super::recording::{Photo, RecordedFrame, Recording};
+use super::staging::Staging;
 use super::video::VideoReader;
 use super::{CaptureFormat, ImportOptions, ImportSummary};
 
@@ -26,26 +30,41 @@ fn extension(bytes: &[u8]) -> &'static str {
     if bytes.starts_with(b"\x89PNG") { "png" } else { "jpg" }
 }
 
-fn load(photo: &Photo, frame: &str, video: &mut Option<VideoReader>) -> Result<Option<Loaded>> {
+/// Names the frame in an error about one of its files.
+fn at_frame(error: Error, id: FrameId) -> Error {
+    match error {
+        Error::Input(mut input) if input.place.as_ref().is_none_or(|place| !place.starts_with("frame ")) => {
+            let within = input.place.take().map(|place| format!(", {place}")).unwrap_or_default();
+            input.at(format!("frame {id}{within}")).into()
+        }
+        other => other,
+    }
+}
+
+/// A photograph's pixels; `Err` is the reason why there are none.
+fn load(photo: &Photo, video: &mut Option<VideoReader>) -> Result<std::result::Result<Loaded, String>> {
     match photo {
         Photo::File(path) => {
-            let bytes = std::fs::read(path).map_err(|e| InputError::unreadable(path, &e).at(frame.to_owned()))?;
+            let bytes = std::fs::read(path).map_err(|e| InputError::unreadable(path, &e))?;
             let image = mb_image::decode_rgb(&bytes, path)?;
             let extension = extension(&bytes);
-            Ok(Some(Loaded { image, original: Some((bytes, extension)) }))
+            Ok(Ok(Loaded { image, original: Some((bytes, extension)) }))
         }
         Photo::Entry(archive, name) => {
             let bytes = archive.read(name)?;
             let image = mb_image::decode_rgb(&bytes, &archive.path().join(name))?;
             let extension = extension(&bytes);
-            Ok(Some(Loaded { image, original: Some((bytes, extension)) }))
+            Ok(Ok(Loaded { image, original: Some((bytes, extension)) }))
         }
         Photo::Video(path, index) => {
             if video.as_ref().is_none_or(|v| v.path() != path) {
                 *video = Some(VideoReader::open(path)?);
             }
-            let image = video.as_mut().expect("opened above").frame(*index)?;
-            Ok(image.map(|image| Loaded { image, original: None }))
+            let video = video.as_mut().expect("opened above");
+            let image = video.frame(*index)?;
+            Ok(image
+                .map(|image| Loaded { image, original: None })
+                .ok_or_else(|| format!("the video ends after {} frames", video.frames_read())))
         }
     }
 }
@@ -64,6 +83,73 @@ fn fitted(k: Intrinsics, stated: Option<ImageSize>, actual: ImageSize) -> std::r
     }
 }
 
+/// A frame that can be written.
+struct Ready {
+    frame_idx: usize,
+    /// Photograph and lens; `None` where the frame is depth or a pose alone.
+    photo: Option<(Loaded, Option<Lens>)>,
+    /// Of the photograph; below that of any where there is none.
+    sharpness: f64,
+}
+
+/// Reads frames one after the other and finds out which can be used.
+struct Reader<'a> {
+    frames: &'a [RecordedFrame],
+    video: Option<VideoReader>,
+    /// Size of the photographs, from the first.
+    size: Option<ImageSize>,
+    /// Frames whose intrinsics were stated for another size.
+    rescaled: usize,
+    /// Whether the source is a camera path and nothing else: no frame has a photograph or depth.
+    path_alone: bool,
+}
+
+impl Reader<'_> {
+    /// A frame's photograph and lens; `Err` is the reason why it cannot be used.
+    fn read(&mut self, frame_idx: usize, judge: bool) -> Result<std::result::Result<Ready, String>> {
+        let frame = &self.frames[frame_idx];
+        let Some(photo) = &frame.photo else {
+            // Depth alone is a frame too, and so is a pose where the source has nothing else.
+            let usable = frame.depth.is_some() || (self.path_alone && frame.world_from_cam.is_some());
+            let without_photo = Ready { frame_idx, photo: None, sharpness: -1.0 };
+            return Ok(if usable { Ok(without_photo) } else { Err("it has no photograph".to_owned()) });
+        };
+        let loaded = match load(photo, &mut self.video)? {
+            Ok(loaded) => loaded,
+            Err(reason) => return Ok(Err(reason)),
+        };
+        let actual = loaded.image.size();
+        let first = *self.size.get_or_insert(actual);
+        if first != actual {
+            return Ok(Err(format!("the photograph is {actual}, those before it are {first}")));
+        }
+        let mut adapted = frame.lens;
+        if let Some(lens) = &mut adapted {
+            match fitted(lens.intrinsics, frame.lens_size, actual) {
+                Ok(k) => {
+                    self.rescaled += usize::from(k != lens.intrinsics);
+                    lens.intrinsics = k;
+                }
+                Err(reason) => return Ok(Err(reason)),
+            }
+        }
+        let sharpness = if judge { PhotoQuality::of(&loaded.image).sharpness } else { 0.0 };
+        Ok(Ok(Ready { frame_idx, photo: Some((loaded, adapted)), sharpness }))
+    }
+}
+
+/// The frames that range and step leave.
+fn selected(frames: Vec<RecordedFrame>, options: &ImportOptions) -> Vec<RecordedFrame> {
+    let in_range = |f: &RecordedFrame| options.range.is_none_or(|(first, last)| (first..=last).contains(&f.id.0));
+    frames.into_iter().filter(in_range).step_by(options.every).collect()
+}
+
+/// Runs of frames of which one each is kept: single ones, or `sharpest` runs of about equal length.
+fn runs(frames: usize, options: &ImportOptions) -> Vec<std::ops::Range<usize>> {
+    let count = options.sharpest.map_or(frames, |k| k.min(frames));
+    (0..count).map(|i| i * frames / count..(i + 1) * frames / count).collect()
+}
+
 /// Writes the selected frames of a recording to `out`.
 pub(super) fn write(
     mut recording: Recording,
@@ -73,91 +159,69 @@ pub(super) fn write(
     options: &ImportOptions,
     progress: &dyn Progress,
 ) -> Result<ImportSummary> {
-    if options.every == 0 {
-        return Err(Error::Failed("'every' must be at least 1".to_owned()));
+    if options.every == 0 || options.sharpest == Some(0) {
+        return Err(Error::Failed("'every' and 'sharpest' must be at least 1".to_owned()));
     }
-    if out.is_dir() && std::fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_some()) {
-        return Err(InputError::new(out, "is not empty")
-            .help("Give a new folder, so that nothing is overwritten")
-            .into());
-    }
+    let staging = Staging::new(out)?;
     let frames_found = recording.frames.len() + recording.skipped.len();
     if let Some(pair) = recording.frames.windows(2).find(|pair| pair[0].id == pair[1].id) {
         return Err(InputError::new(source, "the frame is there twice").at(format!("frame {}", pair[0].id)).into());
     }
-    let frames: Vec<RecordedFrame> = std::mem::take(&mut recording.frames)
-        .into_iter()
-        .filter(|f| options.range.is_none_or(|(first, last)| (first..=last).contains(&f.id.0)))
-        .step_by(options.every)
-        .collect();
+    let path_alone = recording.frames.iter().all(|f| f.photo.is_none() && f.depth.is_none());
+    if path_alone {
+        recording.warnings.push("there are no photographs and no depth maps, only the camera path".to_owned());
+    }
+    let frames = selected(std::mem::take(&mut recording.frames), options);
 
     let steps = Steps::new(progress, "frames", frames.len());
     let mut summary = ImportSummary {
         format,
         frames_found,
         frames_imported: 0,
+        frames_not_selected: 0,
         frames_with_depth: 0,
         frames_with_pose: 0,
+        frames_with_mask: 0,
         frames_skipped: Vec::new(),
         image_size: ImageSize::new(0, 0),
         undistorted: 0,
         metric: recording.metric,
         warnings: Vec::new(),
     };
-    let mut video = None;
+    let mut reader = Reader { frames: &frames, video: None, size: None, rescaled: 0, path_alone };
     let mut times = Vec::new();
-    let mut size = None;
-    let mut rescaled = 0;
-    for frame in &frames {
-        steps.step()?;
-        let name = format!("frame {}", frame.id);
-        let loaded = match &frame.photo {
-            Some(photo) => load(photo, &name, &mut video)?,
-            None => None,
-        };
-        let Some(loaded) = loaded else {
-            // Depth alone is a frame too, where it has a camera.
-            if frame.photo.is_some() || frame.depth.is_none() {
-                recording.skip(frame.id.to_string(), "it has no photograph");
-                continue;
+    for run in runs(frames.len(), options) {
+        let judge = run.len() > 1;
+        let mut best: Option<Ready> = None;
+        for frame_idx in run {
+            let id = frames[frame_idx].id;
+            match reader.read(frame_idx, judge).map_err(|e| at_frame(e, id))? {
+                Ok(ready) if best.as_ref().is_none_or(|best| ready.sharpness > best.sharpness) => best = Some(ready),
+                Ok(_) => {}
+                Err(reason) => recording.skip(id.to_string(), reason),
             }
-            write_frame(out, frame, None, &mut summary)?;
+            steps.step()?;
+        }
+        if let Some(ready) = best {
+            let frame = &frames[ready.frame_idx];
+            write_frame(staging.path(), frame, ready.photo, &mut summary).map_err(|e| at_frame(e, frame.id))?;
             times.push(frame.time_s);
-            continue;
-        };
-        let actual = loaded.image.size();
-        if *size.get_or_insert(actual) != actual {
-            let first = size.unwrap_or(actual);
-            recording.skip(frame.id.to_string(), format!("the photograph is {actual}, those before it are {first}"));
-            continue;
         }
-        let mut adapted = frame.lens;
-        if let Some(lens) = &mut adapted {
-            match fitted(lens.intrinsics, frame.lens_size, actual) {
-                Ok(k) => {
-                    rescaled += usize::from(k != lens.intrinsics);
-                    lens.intrinsics = k;
-                }
-                Err(reason) => {
-                    recording.skip(frame.id.to_string(), reason);
-                    continue;
-                }
-            }
-        }
-        write_frame(out, frame, Some((loaded, adapted)), &mut summary)?;
-        times.push(frame.time_s);
     }
     if summary.frames_imported == 0 {
         let why = recording.skipped.first().map(|s| format!("; frame {}: {}", s.frame, s.reason)).unwrap_or_default();
         return Err(InputError::new(source, format!("none of its {frames_found} frames can be imported{why}")).into());
     }
-    if rescaled > 0 {
+    // What range, step and sharpness left out is neither imported nor skipped.
+    summary.frames_not_selected = frames_found - summary.frames_imported - recording.skipped.len();
+    if reader.rescaled > 0 {
+        let rescaled = reader.rescaled;
         recording.warnings.push(format!("{rescaled} frames state intrinsics for another size of photograph; scaled"));
     }
     if !recording.metric && summary.frames_with_pose > 0 {
         recording.warnings.push("the scale of the poses is arbitrary, not metres".to_owned());
     }
-    summary.image_size = size.unwrap_or(crate::Sequence::PUBLISHED_SIZE);
+    summary.image_size = reader.size.unwrap_or(crate::Sequence::PUBLISHED_SIZE);
     let first = times.iter().flatten().copied().fold(f64::INFINITY, f64::min);
     let meta = SequenceMeta {
         version: 1,
@@ -165,6 +229,7 @@ pub(super) fn write(
         device: recording.device,
         source: source.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
         frame_times_s: times.iter().map(|t| t.map(|t| t - first)).collect(),
+        hashes_sha256: Some(file_hashes(staging.path())?),
         provenance: serde_json::json!({
             "program_version": env!("CARGO_PKG_VERSION"),
             "format": format.name(),
@@ -172,7 +237,8 @@ pub(super) fn write(
             "options": options,
         }),
     };
-    write_json(&out.join("sequence.json"), &meta)?;
+    write_json(&staging.path().join("sequence.json"), &meta)?;
+    staging.finish()?;
     summary.frames_skipped = recording.skipped;
     summary.warnings = recording.warnings;
     Ok(summary)
@@ -181,7 +247,7 @@ pub(super) fn write(
 fn write_frame(
     out: &Path,
     frame: &RecordedFrame,
-    photo: Option<(Loaded, Option<crate::Lens>)>,
+    photo: Option<(Loaded, Option<Lens>)>,
     summary: &mut ImportSummary,
 ) -> Result<()> {
     let id = frame.id;
@@ -189,8 +255,8 @@ fn write_frame(
         Some((_, lens)) => *lens,
         None => frame.lens,
     };
-    if let Some((loaded, lens)) = photo {
-        let bent = lens.filter(|lens| !lens.distortion.is_none());
+    let bent = lens.filter(|lens| !lens.distortion.is_none());
+    if let Some((loaded, _)) = photo {
         match (bent, loaded.original) {
             (Some(lens), _) => {
                 let (image, valid) = lens.undistort(&loaded.image);
@@ -205,6 +271,16 @@ fn write_frame(
                 mb_image::write_jpeg(out.join("image").join(format!("{id}.jpg")), &loaded.image, JPEG_QUALITY)?;
             }
         }
+        if let Some(path) = &frame.mask {
+            let mask = mb_image::read_mask_png(path)?;
+            if mask.size() != loaded.image.size() {
+                let found = format!("the mask is {}, the photograph {}", mask.size(), loaded.image.size());
+                return Err(InputError::new(path, found).into());
+            }
+            let mask = bent.map_or(mask.clone(), |lens| lens.undistort_mask(&mask));
+            mb_image::write_mask_png(out.join("mask").join(format!("{id}.png")), &mask)?;
+            summary.frames_with_mask += 1;
+        }
     }
     if let Some(lens) = lens {
         write_intrinsics_txt(out.join("intrinsic").join(format!("{id}.txt")), &lens.intrinsics)?;
@@ -217,6 +293,10 @@ fn write_frame(
         let (depth, confidence) = depth.read()?;
         mb_image::write_depth_png(out.join("arkit_depth").join(format!("{id}.png")), &depth)?;
         if let Some(confidence) = confidence {
+            if confidence.size() != depth.size() {
+                let found = format!("the confidence map is {}, the depth map {}", confidence.size(), depth.size());
+                return Err(Error::input(out.join("arkit_depth"), found));
+            }
             mb_image::write_confidence_png(out.join("arkit_depth").join(format!("{id}_conf.png")), &confidence)?;
         }
         summary.frames_with_depth += 1;

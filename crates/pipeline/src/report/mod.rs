@@ -30,6 +30,8 @@ pub struct Report {
     pub galleries: Vec<Gallery>,
     /// Threshold curves.
     pub curves: Vec<Curves>,
+    /// Drawings and charts of other kinds.
+    pub drawings: Vec<Drawings>,
     /// What was run, stage after stage.
     pub stages: Vec<Stage>,
     /// What the reader should know although everything ran.
@@ -89,6 +91,17 @@ pub struct Curves {
     pub lines: Vec<(String, Vec<(f64, f64)>)>,
 }
 
+/// Drawings side by side.
+#[derive(Debug)]
+pub struct Drawings {
+    /// Heading.
+    pub title: String,
+    /// A sentence on how to read them.
+    pub note: String,
+    /// Inline SVG with a caption each.
+    pub(crate) figures: Vec<Markup>,
+}
+
 /// One stage of the work.
 #[derive(Debug)]
 pub struct Stage {
@@ -133,6 +146,11 @@ impl Report {
                         h2 { "Scores over the threshold" }
                         p { "Share of the surface within a distance, as the distance grows. Dashed lines are the thresholds of the tables." }
                         div.charts { @for c in &self.curves { (curves(c)) } }
+                    }
+                    @for d in &self.drawings {
+                        h2 { (d.title) }
+                        p { (d.note) }
+                        div.charts { @for figure in &d.figures { (figure) } }
                     }
                     @for g in &galleries { (g) }
                     @if !self.stages.is_empty() { (stages(&self.stages)) }
