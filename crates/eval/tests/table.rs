@@ -47,10 +47,11 @@ fn rows_stand_beside_the_published_ones_and_missing_sequences_are_named() {
     assert_eq!((mine.method.as_str(), mine.origin.as_str()), ("a_one", "4 sequences"));
     assert!((mine.values[2].unwrap() - 70.0).abs() < 1e-9, "percent, the mean over sequences");
     assert_eq!(table.rows.rows[11].origin, "3 of 4 sequences");
-    assert_eq!(table.notes, ["b: no score for jeep; the row is the mean of the other 3"]);
+    assert_eq!(table.notes[0], "b: no score for jeep; the row is the mean of the other 3");
+    assert!(table.notes[1].starts_with("a_one, b: not over the 18 test sequences"), "{:?}", table.notes);
     // Only the three common sequences: 0.05 apart on each, whatever the sequence.
     let difference = &table.differences[0].difference;
-    assert_eq!((difference.sequences, difference.p_two_sided), (3, 0.0));
+    assert_eq!((difference.sequences, difference.p_two_sided, difference.is_significant()), (3, 0.25, false));
     assert!((difference.mean - 5.0).abs() < 1e-9);
     assert_eq!(table.impossible[0].method, "BNV-Fusion");
     for format in TableFormat::ALL {

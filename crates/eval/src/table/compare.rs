@@ -6,6 +6,8 @@ use mb_job::{InputError, Result};
 use serde::Serialize;
 
 use super::documents::{MethodScores, SequenceValues};
+use crate::PUBLISHED_TEST_SEQUENCES;
+
 use super::{ImpossibleRow, PairedDifference, PaperTable, Row, SOURCE, Table, lint, paired_bootstrap};
 
 /// A table with what a reader should know about it.
@@ -46,7 +48,7 @@ impl Difference {
     /// As a sentence.
     pub fn sentence(&self) -> String {
         let d = &self.difference;
-        let verdict = if d.confidence_95.0 > 0.0 || d.confidence_95.1 < 0.0 { "differs" } else { "could be chance" };
+        let verdict = if d.is_significant() { "differs" } else { "could be chance" };
         format!(
             "{} - {}, {}: {:+.4} [{:+.4}, {:+.4}], p = {:.4} over {} sequences: {verdict}",
             self.first,
@@ -121,6 +123,16 @@ fn comparison(table: PaperTable, protocol: String, methods: &[MethodScores], see
             ));
         }
     }
+    if as_published && table == PaperTable::Surfaces {
+        let others: Vec<&str> = methods.iter().filter(|m| !is_over_the_test_sequences(m)).map(|m| &*m.method).collect();
+        if !others.is_empty() {
+            notes.push(format!(
+                "{}: not over the {} test sequences of the published rows, and not comparable with them",
+                others.join(", "),
+                PUBLISHED_TEST_SEQUENCES.len()
+            ));
+        }
+    }
     let column = rows.columns[table.headline()].name.clone();
     let mut differences = Vec::new();
     for (i, first) in methods.iter().enumerate() {
@@ -143,6 +155,11 @@ fn comparison(table: PaperTable, protocol: String, methods: &[MethodScores], see
         notes,
         source: as_published.then_some(SOURCE),
     }
+}
+
+fn is_over_the_test_sequences(method: &MethodScores) -> bool {
+    let scored = |name: &&str| method.sequences.iter().any(|s| s.sequence == *name);
+    method.sequences.len() == PUBLISHED_TEST_SEQUENCES.len() && PUBLISHED_TEST_SEQUENCES.iter().all(scored)
 }
 
 fn count(sequences: usize) -> String {

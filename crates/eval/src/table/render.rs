@@ -93,8 +93,9 @@ impl Table {
         text += "</tr></thead>\n<tbody>\n";
         for row in self.cells(escape_html, |cell| format!("<strong>{cell}</strong>")) {
             text += "<tr>";
-            for cell in row {
-                text += &format!("<td>{cell}</td>");
+            for (at, cell) in row.iter().enumerate() {
+                text += if at < 3 { "<td>" } else { "<td style=\"text-align:right\">" };
+                text += &format!("{cell}</td>");
             }
             text += "</tr>\n";
         }

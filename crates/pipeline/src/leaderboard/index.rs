@@ -227,14 +227,13 @@ fn regions(surfaces: &SurfaceBoard) -> Markup {
 fn differences(comparison: &Comparison) -> Markup {
     html! {
         h3 { "Is the difference chance?" }
-        p { "Paired bootstrap over the sequences that both methods have: the mean of first minus second, its 95 % interval, and how often chance would do as much." }
+        p { "Paired bootstrap over the sequences that both methods have: the mean of first minus second, its 95 % interval, and how often chance would do as much; green where that is below 0.05, which needs six sequences or more." }
         div.scroll { table.sortable {
             thead { tr { th { "first" } th { "second" } th { "difference" } th { "95 % interval" } th { "p" } th { "sequences" } } }
             tbody { @for d in &comparison.differences {
-                @let clear = d.difference.confidence_95.0 > 0.0 || d.difference.confidence_95.1 < 0.0;
                 tr {
                     td { (d.first) } td { (d.second) }
-                    td.best[clear] data-value=(d.difference.mean) { (format!("{:+.3}", d.difference.mean)) }
+                    td.best[d.difference.is_significant()] data-value=(d.difference.mean) { (format!("{:+.3}", d.difference.mean)) }
                     td { (format!("{:+.3} to {:+.3}", d.difference.confidence_95.0, d.difference.confidence_95.1)) }
                     td { (format!("{:.4}", d.difference.p_two_sided)) }
                     td { (d.difference.sequences) }
