@@ -70,6 +70,20 @@ impl Parameters {
             .for_each(|((values, grads), (m, v))| step(values, grads, m, v, constants));
     }
 
+    /// As [`Parameters::step`], with the rate of each run of `width` numbers scaled by its own factor.
+    pub fn step_scaled(&mut self, options: &AdamOptions, lr: f32, t: u64, scales: Option<(&[f32], usize)>) {
+        let Some((scales, width)) = scales else {
+            return self.step(options, lr, t);
+        };
+        let before = self.values.clone();
+        self.step(options, lr, t);
+        self.values.par_chunks_mut(width).zip(before.par_chunks(width)).zip(scales).for_each(|((now, before), scale)| {
+            for (now, before) in now.iter_mut().zip(before) {
+                *now = before + scale * (*now - before);
+            }
+        });
+    }
+
     /// Whether every parameter is a finite number.
     pub fn is_finite(&self) -> bool {
         self.values.par_chunks(PIECE).all(|piece| piece.iter().all(|v| v.is_finite()))

@@ -11,6 +11,8 @@ use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::cameras::CameraResiduals;
+use crate::contraction::expand;
 use crate::region::Region;
 
 /// How photographs become rays.
@@ -85,6 +87,10 @@ impl SceneRay {
 pub struct TargetRay {
     /// The ray.
     pub ray: SceneRay,
+    /// Index of its photograph in [`RayDataset::views`].
+    pub view: u32,
+    /// Its pixel.
+    pub pixel: [f32; 2],
     /// sRGB in 0..=1.
     pub rgb: [f32; 3],
     /// Share of the pixel that the object covers; `None` where there are no masks.
@@ -92,15 +98,46 @@ pub struct TargetRay {
 }
 
 impl View {
+    /// Works out the camera in the scene frame.
+    fn enter(&mut self, region: &Region) {
+        let rotation = self.world_from_cam.rotation_matrix();
+        self.scene_from_cam = std::array::from_fn(|r| std::array::from_fn(|c| rotation[(r, c)] as f32));
+        let center = region.scene_from_world(&self.world_from_cam.translation().into());
+        self.center = [center.x as f32, center.y as f32, center.z as f32];
+    }
+
     /// The ray through pixel (x, y); centres lie at integers.
     #[inline]
     pub fn ray(&self, x: f32, y: f32) -> SceneRay {
-        let k = &self.intrinsics;
-        let v = [(x - k.cx as f32) / k.fx as f32, (y - k.cy as f32) / k.fy as f32, 1.0];
-        let r = &self.scene_from_cam;
-        let direction: [f32; 3] = std::array::from_fn(|d| r[d][0] * v[0] + r[d][1] * v[1] + r[d][2] * v[2]);
+        let direction = self.rotated(self.through([x, y]));
         let length = direction.iter().map(|c| c * c).sum::<f32>().sqrt();
         SceneRay { origin: self.center, direction: direction.map(|c| c / length) }
+    }
+
+    /// The point of a pixel on the plane at depth 1 of the camera frame.
+    #[inline]
+    pub(crate) fn through(&self, pixel: [f32; 2]) -> [f32; 3] {
+        let k = &self.intrinsics;
+        [(pixel[0] - k.cx as f32) / k.fx as f32, (pixel[1] - k.cy as f32) / k.fy as f32, 1.0]
+    }
+
+    /// A vector of the camera frame in the scene frame.
+    #[inline]
+    pub(crate) fn rotated(&self, v: [f32; 3]) -> [f32; 3] {
+        let r = &self.scene_from_cam;
+        std::array::from_fn(|d| r[d][0] * v[0] + r[d][1] * v[1] + r[d][2] * v[2])
+    }
+
+    /// A vector of the scene frame in the camera frame.
+    #[inline]
+    pub(crate) fn rotated_back(&self, v: [f32; 3]) -> [f32; 3] {
+        let r = &self.scene_from_cam;
+        std::array::from_fn(|d| r[0][d] * v[0] + r[1][d] * v[1] + r[2][d] * v[2])
+    }
+
+    /// Centre of projection, scene frame.
+    pub(crate) fn center(&self) -> [f32; 3] {
+        self.center
     }
 
     /// Width and height at working size.
@@ -108,9 +145,12 @@ impl View {
         self.rgb.size()
     }
 
-    fn target(&self, x: usize, y: usize) -> TargetRay {
+    fn target(&self, view: usize, x: usize, y: usize, cameras: &CameraResiduals) -> TargetRay {
+        let pixel = [x as f32, y as f32];
         TargetRay {
-            ray: self.ray(x as f32, y as f32),
+            ray: cameras.ray(self, view, pixel),
+            view: view as u32,
+            pixel,
             rgb: self.rgb[(x, y)].map(|v| f32::from(v) / 255.0),
             mask: self.mask.as_ref().map(|m| f32::from(m[(x, y)]) / 255.0),
         }
@@ -174,12 +214,7 @@ impl RayDataset {
             return Err("fewer than 2 photographs are left for training".to_owned());
         }
         let region = Region::find(&views)?;
-        for view in &mut views {
-            let rotation = view.world_from_cam.rotation_matrix();
-            view.scene_from_cam = std::array::from_fn(|r| std::array::from_fn(|c| rotation[(r, c)] as f32));
-            let center = region.scene_from_world(&view.world_from_cam.translation().into());
-            view.center = [center.x as f32, center.y as f32, center.z as f32];
-        }
+        views.iter_mut().for_each(|view| view.enter(&region));
         let training = (0..views.len()).filter(|i| !views[*i].held_out).collect();
         Ok(Self { views, training, region, warnings })
     }
@@ -232,14 +267,72 @@ impl RayDataset {
         &self.warnings
     }
 
-    /// Replaces `out` by `n` rays of training pixels, drawn uniformly.
-    pub fn draw(&self, rng: &mut Rng, n: usize, out: &mut Vec<TargetRay>) {
+    /// Replaces `out` by `n` rays of training pixels, drawn uniformly, from cameras with these residuals.
+    pub fn draw(&self, rng: &mut Rng, n: usize, cameras: &CameraResiduals, out: &mut Vec<TargetRay>) {
         out.clear();
         out.extend((0..n).map(|_| {
-            let view = &self.views[self.training[rng.random_range(0..self.training.len())]];
+            let index = self.training[rng.random_range(0..self.training.len())];
+            let view = &self.views[index];
             let pixel = rng.random_range(0..view.size().pixels());
-            view.target(pixel % view.size().width, pixel / view.size().width)
+            view.target(index, pixel % view.size().width, pixel / view.size().width, cameras)
         }));
+    }
+
+    /// How many training cameras see something of a cell of contracted space that is not nearer than `near`; the cell is
+    /// given by its centre and half edge in the unit cube.
+    pub fn seen_by(&self, center: [f32; 3], half: f32, near: f32) -> usize {
+        let inside = |v: f32| v.clamp(0.002, 0.998);
+        let at = |sign: f32| expand(center.map(|c| inside(c + sign * half)));
+        let (low, middle, high) = (at(-1.0), at(0.0), at(1.0));
+        let reach = (0..3).map(|d| (high[d] - low[d]).powi(2)).sum::<f32>().sqrt() * 0.5;
+        let mut seen = 0;
+        for view in self.training.iter().map(|i| &self.views[*i]) {
+            let p = view.rotated_back(std::array::from_fn(|d| middle[d] - view.center[d]));
+            if p.iter().map(|c| c * c).sum::<f32>().sqrt() + reach < near || p[2] + reach <= 0.0 {
+                continue;
+            }
+            let (k, z) = (&view.intrinsics, p[2].max(1e-3));
+            let margin = k.fx.max(k.fy) as f32 * reach / z;
+            let (x, y) = (k.fx as f32 * p[0] / z + k.cx as f32, k.fy as f32 * p[1] / z + k.cy as f32);
+            let (width, height) = (view.size().width as f32, view.size().height as f32);
+            if x > -margin && y > -margin && x < width + margin && y < height + margin {
+                seen += 1;
+            }
+        }
+        seen
+    }
+
+    /// A view that no photograph was taken from: black.
+    pub(crate) fn new_view(
+        &self,
+        frame: FrameId,
+        intrinsics: Intrinsics,
+        size: ImageSize,
+        world_from_cam: Rigid3<World, Camera>,
+    ) -> View {
+        let rgb = Image::from_fn(size, |_, _| [0; 3]);
+        let mut view = View {
+            frame,
+            intrinsics,
+            world_from_cam,
+            rgb,
+            mask: None,
+            held_out: false,
+            scene_from_cam: [[0.0; 3]; 3],
+            center: [0.0; 3],
+        };
+        view.enter(&self.region);
+        view
+    }
+
+    /// Indices of the views that are trained on.
+    pub fn training(&self) -> &[usize] {
+        &self.training
+    }
+
+    /// Bytes that the photographs and masks take.
+    pub fn bytes(&self) -> usize {
+        self.views.iter().map(|v| v.size().pixels() * (3 + usize::from(v.mask.is_some()))).sum()
     }
 
     /// A number that changes with the pictures, cameras or region, to tell a checkpoint of other data.

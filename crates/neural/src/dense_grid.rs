@@ -66,6 +66,23 @@ impl DenseGrid {
         }
     }
 
+    /// Adds to `to` the gradient with respect to position of `g . v(x)`; `g` is `[samples, channels]`.
+    pub fn input_gradient(&self, data: &[f32], positions: &[[f32; 3]], g: &[f32], to: &mut [[f32; 3]]) {
+        for ((p, g), to) in positions.iter().zip(g.chunks_exact(self.channels)).zip(to) {
+            let (base, t) = self.cell(*p);
+            for c in 0..8 {
+                let at = self.corner(base, c);
+                let value: f32 = data[at..at + self.channels].iter().zip(g).map(|(a, b)| a * b).sum();
+                let pick = |d: usize| if c >> d & 1 == 1 { t[d] } else { 1.0 - t[d] };
+                for d in 0..3 {
+                    let others = pick((d + 1) % 3) * pick((d + 2) % 3);
+                    let sign = if c >> d & 1 == 1 { 1.0 } else { -1.0 };
+                    to[d] += value * others * sign * (self.size[d] - 1) as f32;
+                }
+            }
+        }
+    }
+
     /// Adds what each batch (positions; `[samples, stride]` derivatives from column `first`) sends back to `grads`.
     /// Slabs of the grid run in parallel, samples in their order inside each.
     pub fn scatter(&self, batches: &[(&[[f32; 3]], &[f32])], stride: usize, first: usize, grads: &mut [f32]) {

@@ -86,6 +86,16 @@ impl Cell {
         dx * v[0] + dy * v[1] + dz * v[2]
     }
 
+    /// `sum_d v_d d/dt_k dw/dt_d` for each k; trilinear weights have no pure second derivatives.
+    #[inline(always)]
+    fn weight_second(&self, corner: usize, v: [f32; 3]) -> [f32; 3] {
+        let pick = |d: usize| if corner >> d & 1 == 1 { self.t[d] } else { 1.0 - self.t[d] };
+        let sign = |d: usize| if corner >> d & 1 == 1 { 1.0 } else { -1.0 };
+        let (xy, xz, yz) =
+            (sign(0) * sign(1) * pick(2), sign(0) * sign(2) * pick(1), sign(1) * sign(2) * pick(0));
+        [xy * v[1] + xz * v[2], xy * v[0] + yz * v[2], xz * v[0] + yz * v[1]]
+    }
+
     #[inline(always)]
     fn weight_gradient(&self, corner: usize) -> [f32; 3] {
         let pick = |d: usize| if corner >> d & 1 == 1 { self.t[d] } else { 1.0 - self.t[d] };
@@ -338,6 +348,50 @@ impl HashGrid {
         }
     }
 
+    /// Adds to `to` what a loss with derivative `d_n` on the gradient n of `g . e(x)` sends back to the position:
+    /// `sum_d dn_d d/dx n_d`.
+    pub fn second_gradient(
+        &self,
+        table: &[f32],
+        positions: &[[f32; 3]],
+        active: usize,
+        g: &[f32],
+        d_n: &[[f32; 3]],
+        stride: usize,
+        first: usize,
+        to: &mut [[f32; 3]],
+    ) {
+        with_features!(self, second_gradient_f(table, positions, active, g, d_n, stride, first, to));
+    }
+
+    fn second_gradient_f<const F: usize>(
+        &self,
+        table: &[f32],
+        positions: &[[f32; 3]],
+        active: usize,
+        g: &[f32],
+        d_n: &[[f32; 3]],
+        stride: usize,
+        first: usize,
+        to: &mut [[f32; 3]],
+    ) {
+        for (l, level) in self.levels.iter().enumerate().take(active) {
+            let scale = (level.cells as f32) * (level.cells as f32);
+            for (((p, g), d_n), to) in positions.iter().zip(g.chunks_exact(stride)).zip(d_n).zip(to.iter_mut()) {
+                let g = &g[first + l * F..first + (l + 1) * F];
+                let cell = level.cell(*p);
+                for c in 0..8 {
+                    let theta = entry::<F>(table, level, cell.corners[c]);
+                    let value: f32 = scale * (0..F).map(|f| g[f] * theta[f]).sum::<f32>();
+                    let second = cell.weight_second(c, *d_n);
+                    for d in 0..3 {
+                        to[d] += value * second[d];
+                    }
+                }
+            }
+        }
+    }
+
     /// Adds what the batches send back to `grads`, laid out like the table. Levels run in parallel; inside a level the
     /// batches and their samples are added in order.
     pub fn scatter(&self, batches: &[Scatter<'_>], active: usize, grads: &mut [f32]) {
@@ -461,6 +515,21 @@ mod tests {
                     unit[s][d] = 1.0;
                     let expected = loss(&grid, &table, &x, &g, &zero, &unit);
                     assert!((f64::from(n[d]) - expected).abs() < 2e-3, "normal {} is not {expected}", n[d]);
+                }
+            }
+            let mut to = vec![[0.0; 3]; 9];
+            grid.second_gradient(&table, &x, 3, &g, &d_n, width, 0, &mut to);
+            for s in 0..9 {
+                for d in 0..3 {
+                    let at = |h: f32| {
+                        let mut p = x[s];
+                        p[d] += h;
+                        let mut n = [[0.0; 3]];
+                        grid.input_gradient(&table, &[p], 3, &g[s * width..(s + 1) * width], width, 0, &mut n);
+                        (0..3).map(|i| f64::from(n[0][i] * d_n[s][i])).sum::<f64>()
+                    };
+                    let expected = (at(1e-3) - at(-1e-3)) / 2e-3;
+                    assert!((f64::from(to[s][d]) - expected).abs() < 0.05, "{} is not {expected}", to[s][d]);
                 }
             }
             // The loss is linear in the table and in g, so any step is exact.

@@ -8,7 +8,7 @@
 //! use mb_neural::{FieldOptions, reconstruct};
 //! let sequence = mb_capture::Sequence::open("castle")?;
 //! let options = FieldOptions::preset("neus", "fast", 0).expect("a known method");
-//! let (mesh, summary) = reconstruct(&sequence, &options, &mb_job::Silent)?;
+//! let (mesh, summary) = reconstruct(&sequence, &options, None, &mb_job::Silent)?;
 //! println!("{} triangles after {:.0} s", mesh.triangles.len(), summary.training.seconds);
 //! # Ok(())
 //! # }
@@ -30,26 +30,37 @@
 #![allow(clippy::too_many_arguments, reason = "kernels take buffers with their strides")]
 
 pub mod adam;
+pub mod camera_path;
+pub mod cameras;
+mod checkpoint;
 pub mod composite;
 pub mod contraction;
 pub mod dataset;
 pub mod dense_grid;
+pub mod dvgo;
 pub mod encoding;
 pub mod extract;
+pub mod frequency_field;
 pub mod hash_grid;
 mod method;
 pub mod mlp;
 pub mod model;
 pub mod nerf;
+pub mod nerf_original;
 pub mod network;
 pub mod neus;
 pub mod neus_alpha;
+pub mod neus_original;
 pub mod occupancy;
 pub mod radiance_field;
 pub mod region;
+pub mod results;
 pub mod sampling;
 pub mod sdf_field;
 pub mod simd;
 pub mod trainer;
+pub mod voxel_field;
 
-pub use method::{FieldOptions, Method, ReconstructSummary, SynthesizeSummary, ViewScore, reconstruct, synthesize};
+pub use method::{
+    FieldOptions, Method, ReconstructSummary, SynthesizeSummary, ViewScore, Views, reconstruct, synthesize,
+};

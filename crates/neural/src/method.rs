@@ -1,28 +1,52 @@
 //! Whole methods: a sequence in, a mesh or pictures out.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use mb_capture::{FrameId, Sequence};
+use mb_image::RgbImage;
 use mb_job::{Progress, Result, Steps};
 use mb_mesh::TriangleMesh;
 use serde::{Deserialize, Serialize};
 
-use crate::dataset::{DataOptions, RayDataset};
+use crate::camera_path::{CameraPath, new_views};
+use crate::cameras::{CameraOptions, CameraResiduals};
+use crate::dataset::{DataOptions, RayDataset, View};
+use crate::dvgo::{Dvgo, DvgoOptions};
 use crate::extract::{SurfaceOptions, extract};
 use crate::model::Model;
 use crate::nerf::{Nerf, NerfOptions};
+use crate::nerf_original::{NerfOriginal, NerfOriginalOptions};
 use crate::neus::{Neus, NeusOptions};
+use crate::neus_original::{NeusOriginal, NeusOriginalOptions};
 use crate::region::Region;
-use crate::trainer::{RunOptions, TrainSummary, image_psnr_db, render_view, train};
+use crate::results::{write_cameras, write_film};
+use crate::trainer::{RunOptions, TrainSummary, image_psnr_db, render_new_view, render_view, train};
 
 /// A method with its options.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Method {
-    /// Density and colour.
+    /// Density and colour on a hash grid.
     Nerf(NerfOptions),
-    /// Signed distance and colour.
+    /// Density and colour in two networks, as NeRF began.
+    NerfOriginal(NerfOriginalOptions),
+    /// Density and colour on voxels.
+    Dvgo(DvgoOptions),
+    /// Signed distance and colour on a hash grid.
     Neus(NeusOptions),
+    /// Signed distance and colour in deep networks, as NeuS began.
+    NeusOriginal(NeusOriginalOptions),
+}
+
+impl Method {
+    /// `nerf`, `dvgo` or `neus`, whichever the preset.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Nerf(_) | Self::NerfOriginal(_) => "nerf",
+            Self::Dvgo(_) => "dvgo",
+            Self::Neus(_) | Self::NeusOriginal(_) => "neus",
+        }
+    }
 }
 
 /// Everything that decides a run's result, and how it is kept.
@@ -34,6 +58,9 @@ pub struct FieldOptions {
     /// The photographs.
     #[serde(default)]
     pub data: DataOptions,
+    /// Correction of the cameras.
+    #[serde(default)]
+    pub cameras: CameraOptions,
     /// The run.
     #[serde(default)]
     pub run: RunOptions,
@@ -44,18 +71,26 @@ pub struct FieldOptions {
 
 impl FieldOptions {
     /// The names that [`FieldOptions::preset`] knows.
-    pub const METHODS: [&'static str; 2] = ["nerf", "neus"];
+    pub const METHODS: [&'static str; 3] = ["nerf", "dvgo", "neus"];
 
-    /// The options of a method (`nerf`, `neus`) in the preset `fast`; `None` for other names.
+    /// The names that it knows of their presets: small enough for a processor, and as published.
+    pub const PRESETS: [&'static str; 2] = ["fast", "paper"];
+
+    /// The options of a method in a preset; `None` for other names.
     pub fn preset(method: &str, preset: &str, seed: u64) -> Option<Self> {
         let method = match (method, preset) {
             ("nerf", "fast") => Method::Nerf(NerfOptions { seed, ..NerfOptions::default() }),
+            ("nerf", "paper") => Method::NerfOriginal(NerfOriginalOptions { seed, ..NerfOriginalOptions::paper() }),
+            ("dvgo", "fast") => Method::Dvgo(DvgoOptions { seed, ..DvgoOptions::fast() }),
+            ("dvgo", "paper") => Method::Dvgo(DvgoOptions { seed, ..DvgoOptions::paper() }),
             ("neus", "fast") => Method::Neus(NeusOptions { seed, ..NeusOptions::default() }),
+            ("neus", "paper") => Method::NeusOriginal(NeusOriginalOptions { seed, ..NeusOriginalOptions::paper() }),
             _ => return None,
         };
         Some(Self {
             method,
             data: DataOptions::default(),
+            cameras: CameraOptions::default(),
             run: RunOptions::default(),
             surface: SurfaceOptions::default(),
         })
@@ -66,20 +101,39 @@ impl FieldOptions {
     pub fn with_iterations(mut self, iterations: u64) -> Self {
         self.method = match self.method {
             Method::Nerf(o) => Method::Nerf(o.with_iterations(iterations)),
+            Method::NerfOriginal(o) => Method::NerfOriginal(o.with_iterations(iterations)),
+            Method::Dvgo(o) => Method::Dvgo(o.with_iterations(iterations)),
             Method::Neus(o) => Method::Neus(o.with_iterations(iterations)),
+            Method::NeusOriginal(o) => Method::NeusOriginal(o.with_iterations(iterations)),
         };
         self
     }
 
-    fn train(&self, data: &RayDataset, progress: &dyn Progress) -> Result<(Box<dyn Model>, TrainSummary)> {
-        let mut model: Box<dyn Model> = match &self.method {
-            Method::Nerf(options) => Box::new(Nerf::new(options.clone())),
+    /// The untrained model.
+    pub fn model(&self, data: &RayDataset) -> Box<dyn Model> {
+        match &self.method {
+            Method::Nerf(options) => Box::new(Nerf::new(options.clone(), data)),
+            Method::NerfOriginal(options) => Box::new(NerfOriginal::new(options.clone(), data)),
+            Method::Dvgo(options) => Box::new(Dvgo::new(options.clone(), data)),
             Method::Neus(options) => Box::new(Neus::new(options.clone(), data)),
-        };
-        let json = serde_json::to_value(&self.method).expect("options are plain data with string keys");
-        let summary = train(model.as_mut(), data, &json, &self.run, progress)?;
-        Ok((model, summary))
+            Method::NeusOriginal(options) => Box::new(NeusOriginal::new(options.clone(), data)),
+        }
     }
+
+    fn train(&self, data: &RayDataset, progress: &dyn Progress) -> Result<Trained> {
+        let mut model = self.model(data);
+        let mut cameras = CameraResiduals::new(&self.cameras, data);
+        let json = serde_json::to_value((&self.method, &self.cameras)).expect("options are plain data with string keys");
+        let summary = train(model.as_mut(), data, &mut cameras, &json, &self.run, progress)?;
+        Ok(Trained { model, cameras, summary })
+    }
+}
+
+/// A trained field.
+struct Trained {
+    model: Box<dyn Model>,
+    cameras: CameraResiduals,
+    summary: TrainSummary,
 }
 
 /// What [`reconstruct`] did.
@@ -99,21 +153,27 @@ pub struct ReconstructSummary {
     pub warnings: Vec<String>,
 }
 
-/// Trains on every photograph (none is held out) and extracts the surface: world frame, metres, vertex colours.
+/// Trains on every photograph (none is held out) and extracts the surface: world frame, metres, vertex colours. Where
+/// cameras were corrected, their poses are written to `cameras_to/pose/`.
 ///
 /// # Errors
 /// As [`RayDataset::open`], [`train`] and [`extract`].
 pub fn reconstruct(
     sequence: &Sequence,
     options: &FieldOptions,
+    cameras_to: Option<&Path>,
     progress: &dyn Progress,
 ) -> Result<(TriangleMesh, ReconstructSummary)> {
     let all = DataOptions { hold_out_every: 0, ..options.data.clone() };
-    let data = RayDataset::open(sequence, &all, progress)?;
-    let (model, training) = options.train(&data, progress)?;
+    let options = FieldOptions { data: all, ..options.clone() };
+    let data = RayDataset::open(sequence, &options.data, progress)?;
+    let Trained { model, cameras, summary: training } = options.train(&data, progress)?;
     let mesh = extract(model.as_ref(), &data, &options.surface, progress)?;
+    if let Some(folder) = cameras_to.filter(|_| cameras.size().is_some()) {
+        write_cameras(folder, &data, &cameras)?;
+    }
     let summary = ReconstructSummary {
-        options: FieldOptions { data: all, ..options.clone() },
+        options,
         region: *data.region(),
         images: data.views().len(),
         training,
@@ -132,6 +192,19 @@ pub struct ViewScore {
     pub psnr_db: f64,
 }
 
+/// Which pictures [`synthesize`] makes, and where they go.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Views {
+    /// Which views.
+    pub path: CameraPath,
+    /// Folder for `NNNNNN.png`, and `reference/NNNNNN.png` where there are photographs.
+    pub out: PathBuf,
+    /// A film of them, where one is wanted.
+    pub film: Option<PathBuf>,
+    /// Pictures of the film in a second.
+    pub frames_per_second: f64,
+}
+
 /// What [`synthesize`] did.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SynthesizeSummary {
@@ -143,43 +216,62 @@ pub struct SynthesizeSummary {
     pub training: TrainSummary,
     /// Rendered views.
     pub images: usize,
-    /// Mean over them.
-    pub psnr_db: f64,
-    /// Each of them.
+    /// Mean over the views that have a photograph; `None` where none has.
+    pub psnr_db: Option<f64>,
+    /// Each view that has a photograph.
     pub per_image: Vec<ViewScore>,
     /// What was found and mended.
     pub warnings: Vec<String>,
 }
 
-/// Trains on all but the held-out photographs and renders those: `out/NNNNNN.png`, and the photograph at the same size
-/// as `out/reference/NNNNNN.png`, so that `eval views --gt OUT/reference --pred OUT` scores them.
+/// Trains on all but the held-out photographs and renders views: the held-out ones, with the photographs at the same
+/// size as `reference/NNNNNN.png`, so that `eval views --gt OUT/reference --pred OUT` scores them; or others.
 ///
 /// # Errors
-/// As [`RayDataset::open`] and [`train`]; a picture cannot be written.
+/// As [`RayDataset::open`], [`train`], [`CameraPath`] and [`write_film`]; a picture cannot be written.
 pub fn synthesize(
     sequence: &Sequence,
     options: &FieldOptions,
-    out: &Path,
+    views: &Views,
     progress: &dyn Progress,
 ) -> Result<SynthesizeSummary> {
     let data = RayDataset::open(sequence, &options.data, progress)?;
-    let (model, training) = options.train(&data, progress)?;
-    let steps = Steps::new(progress, "rendering held-out views", data.held_out().count());
+    // Before the long work: a path that cannot be read is told at once.
+    let others = match &views.path {
+        CameraPath::HeldOut => Vec::new(),
+        path => new_views(path, &data, sequence.image_size())?,
+    };
+    let Trained { model, cameras, summary: training } = options.train(&data, progress)?;
     let mut per_image = Vec::new();
-    for view in data.held_out() {
-        let image = render_view(model.as_ref(), view);
-        let name = format!("{}.png", view.frame);
-        mb_image::write_rgb_png(out.join(&name), &image)?;
-        mb_image::write_rgb_png(out.join("reference").join(&name), &view.rgb)?;
+    let mut images = Vec::new();
+    let held_out: Vec<_> = data.views().iter().enumerate().filter(|(_, v)| v.held_out && others.is_empty()).collect();
+    let steps = Steps::new(progress, "rendering views", held_out.len() + others.len());
+    let mut keep = |view: &View, image: RgbImage| -> Result<()> {
+        mb_image::write_rgb_png(views.out.join(format!("{}.png", view.frame)), &image)?;
+        if views.film.is_some() {
+            images.push(image);
+        }
+        steps.step()
+    };
+    for (index, view) in &held_out {
+        let image = render_view(model.as_ref(), view, *index, &cameras);
+        mb_image::write_rgb_png(views.out.join("reference").join(format!("{}.png", view.frame)), &view.rgb)?;
         per_image.push(ViewScore { frame: view.frame, psnr_db: image_psnr_db(&image, &view.rgb) });
-        steps.step()?;
+        keep(view, image)?;
     }
+    for view in &others {
+        keep(view, render_new_view(model.as_ref(), view))?;
+    }
+    if let Some(film) = &views.film {
+        write_film(film, &images, views.frames_per_second)?;
+    }
+    let mean = per_image.iter().map(|v| v.psnr_db).sum::<f64>() / per_image.len().max(1) as f64;
     Ok(SynthesizeSummary {
         options: options.clone(),
         region: *data.region(),
         training,
-        images: per_image.len(),
-        psnr_db: per_image.iter().map(|v| v.psnr_db).sum::<f64>() / per_image.len().max(1) as f64,
+        images: held_out.len() + others.len(),
+        psnr_db: (!per_image.is_empty()).then_some(mean),
         per_image,
         warnings: data.warnings().to_vec(),
     })

@@ -1,5 +1,6 @@
 //! What the trainer needs of a method.
 
+use crate::cameras::CameraResiduals;
 use crate::dataset::{RayDataset, SceneRay};
 
 /// What one training step found.
@@ -32,7 +33,7 @@ pub trait Model: Sync {
     /// Steps of a whole run.
     fn iterations(&self) -> u64;
     /// One step, counted from 0.
-    fn step(&mut self, data: &RayDataset, step: u64) -> StepReport;
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport;
     /// Colours of rays.
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]>;
     /// The surface's level.
@@ -45,12 +46,27 @@ pub trait Model: Sync {
     fn color_at(&self, positions: &[[f32; 3]], directions: &[[f32; 3]]) -> Vec<[f32; 3]>;
     /// Everything that a checkpoint holds, always in the same order.
     fn buffers(&mut self) -> Vec<&mut Vec<f32>>;
-    /// Called after a checkpoint has been read into the buffers, before `step`.
-    fn restored(&mut self, step: u64);
+    /// Called after a checkpoint has been read into the buffers, which then have the lengths that they had when it was
+    /// written; `step` comes next.
+    ///
+    /// # Errors
+    /// The buffers do not fit the model.
+    fn restored(&mut self, step: u64) -> Result<(), String>;
     /// Whether every parameter is a finite number.
     fn is_finite(&self) -> bool;
     /// Number of parameters.
     fn parameter_count(&self) -> usize;
+    /// Bytes of the parameters with their gradients and moments, and of the work buffers of a step, at their largest.
+    fn bytes(&self) -> usize;
+}
+
+/// Whether a checkpoint gave each buffer the length that it has to have.
+pub(crate) fn same_lengths(buffers: &[&mut Vec<f32>], lengths: &[usize]) -> Result<(), String> {
+    if buffers.len() == lengths.len() && buffers.iter().zip(lengths).all(|(b, n)| b.len() == *n) {
+        Ok(())
+    } else {
+        Err("the checkpoint belongs to a run with other options".to_owned())
+    }
 }
 
 /// Independent pieces of a step. Fixed, because each piece has its own stream of random numbers and its own sums.

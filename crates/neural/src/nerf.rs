@@ -11,11 +11,12 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::adam::Schedule;
-use crate::composite::{Composite, CompositeGradient, composite, composite_backward, opacity};
-use crate::contraction::contract;
+use crate::cameras::{CameraResiduals, RayGradient};
+use crate::composite::{Composite, CompositeGradient, composite, composite_backward, distortion, opacity};
+use crate::contraction::{contract, contract_gradient};
 use crate::dataset::{RayDataset, SceneRay, TargetRay};
 use crate::hash_grid::HashGridOptions;
-use crate::model::{GROUPS, Level, Model, StepReport, TILE};
+use crate::model::{GROUPS, Level, Model, StepReport, TILE, same_lengths};
 use crate::occupancy::{CELL_MEMORY, OccupancyGrid, TURNS};
 use crate::radiance_field::{RadianceField, RadianceFieldOptions, RadianceParameters, RadianceWorker, Transposed};
 
@@ -45,6 +46,8 @@ pub struct NerfOptions {
     pub occupancy: usize,
     /// Steps between refreshes of a sixteenth of the grid.
     pub occupancy_every: u64,
+    /// Weight of the distortion loss, which gathers the light of a ray in one place (mip-NeRF 360: 0.01).
+    pub distortion: f32,
     /// Learn only what the masks show, before a random background.
     pub object_only: bool,
     /// Density of the extracted surface, per radius.
@@ -72,6 +75,7 @@ impl Default for NerfOptions {
             cone: 1.0 / 96.0,
             occupancy: 128,
             occupancy_every: 16,
+            distortion: 0.005,
             object_only: false,
             surface_density: 40.0,
             seed: 0,
@@ -93,6 +97,8 @@ impl NerfOptions {
 #[derive(Debug, Default)]
 struct Tile {
     positions: Vec<[f32; 3]>,
+    /// Distance of each sample, and the length of its stretch.
+    depths: Vec<f32>,
     lengths: Vec<f32>,
     /// Samples and direction of each ray.
     runs: Vec<(u32, [f32; 3])>,
@@ -109,8 +115,22 @@ struct Group {
     tile: Tile,
     rays: Vec<TargetRay>,
     backgrounds: Vec<[f32; 3]>,
+    gradients: Vec<RayGradient>,
+    /// Cells that were sampled, and the density found.
+    seen: Vec<(u32, f32)>,
     loss: f64,
+    distortion: f64,
     marched: usize,
+}
+
+/// What a step asks of its groups.
+#[derive(Clone, Copy)]
+struct Task<'a> {
+    data: &'a RayDataset,
+    cameras: &'a CameraResiduals,
+    transposed: &'a Transposed,
+    rays: usize,
+    move_cameras: bool,
 }
 
 /// A NeRF in training.
@@ -128,12 +148,14 @@ pub struct Nerf {
 const DARK: f32 = 1e-3;
 
 impl Nerf {
-    /// A NeRF at its start.
-    pub fn new(options: NerfOptions) -> Self {
+    /// A NeRF at its start. Where fewer than two cameras look, nothing can be known and nothing is kept.
+    pub fn new(options: NerfOptions, data: &RayDataset) -> Self {
         let field = RadianceField::new(&options.field);
         let parameters = field.init(&mut rng(options.seed, u64::MAX));
+        let mut occupancy = OccupancyGrid::new(options.occupancy);
+        occupancy.close(|center, half| data.seen_by(center, half, options.near) >= 2);
         Self {
-            occupancy: OccupancyGrid::new(options.occupancy),
+            occupancy,
             samples_per_ray: vec![128.0],
             groups: (0..GROUPS).map(|_| Group::default()).collect(),
             options,
@@ -153,6 +175,7 @@ impl Nerf {
             let u = contract(ray.at(t));
             if self.occupancy.is_occupied(u) {
                 tile.positions.push(u);
+                tile.depths.push(t);
                 tile.lengths.push(dt);
             }
             t += dt;
@@ -161,9 +184,19 @@ impl Nerf {
     }
 
     /// Drops samples that no light reaches, then computes densities, opacities, colours and composites of the tile.
-    fn shade(&self, tile: &mut Tile, worker: &mut RadianceWorker, backgrounds: &[[f32; 3]]) {
+    /// With `seen`, notes the density of every sampled cell.
+    fn shade(
+        &self,
+        tile: &mut Tile,
+        worker: &mut RadianceWorker,
+        backgrounds: &[[f32; 3]],
+        seen: Option<&mut Vec<(u32, f32)>>,
+    ) {
         let p = &self.parameters;
         self.field.density(p, &tile.positions, worker);
+        if let Some(seen) = seen {
+            seen.extend(tile.positions.iter().map(|p| self.occupancy.cell(*p) as u32).zip(worker.sigma.iter().copied()));
+        }
         tile.keep.clear();
         let mut first = 0;
         for run in &mut tile.runs {
@@ -185,9 +218,11 @@ impl Nerf {
             self.field.compact(p, &tile.keep, worker);
             for (to, from) in tile.keep.iter().enumerate() {
                 tile.positions[to] = tile.positions[*from as usize];
+                tile.depths[to] = tile.depths[*from as usize];
                 tile.lengths[to] = tile.lengths[*from as usize];
             }
             tile.positions.truncate(tile.keep.len());
+            tile.depths.truncate(tile.keep.len());
             tile.lengths.truncate(tile.keep.len());
         }
         self.field.color(p, &tile.runs, worker);
@@ -206,66 +241,93 @@ impl Nerf {
 
     fn clear(tile: &mut Tile) {
         tile.positions.clear();
+        tile.depths.clear();
         tile.lengths.clear();
         tile.runs.clear();
     }
 
-    fn run_group(
-        &self,
-        data: &RayDataset,
-        rng: &mut Rng,
-        rays: usize,
-        scale: f32,
-        transposed: &Transposed,
-        group: &mut Group,
-    ) {
-        let Group { field: worker, tile, rays: targets, backgrounds, loss, marched } = group;
-        data.draw(rng, rays, targets);
-        (*loss, *marched) = (0.0, 0);
+    fn run_group(&self, task: &Task<'_>, rng: &mut Rng, group: &mut Group) {
+        let scale = 1.0 / (3 * task.rays * GROUPS) as f32;
+        task.data.draw(rng, task.rays, task.cameras, &mut group.rays);
+        (group.loss, group.distortion, group.marched) = (0.0, 0.0, 0);
+        group.gradients.clear();
         let mut next = 0;
-        while next < targets.len() {
+        while next < group.rays.len() {
             let first = next;
-            Self::clear(tile);
-            backgrounds.clear();
-            while next < targets.len() && tile.positions.len() < TILE {
+            Self::clear(&mut group.tile);
+            group.backgrounds.clear();
+            while next < group.rays.len() && group.tile.positions.len() < TILE {
                 // A random background, so that nothing can hide behind a transparent foreground.
-                backgrounds.push(std::array::from_fn(|_| rng.random()));
-                self.march(&targets[next].ray, rng.random(), tile);
+                group.backgrounds.push(std::array::from_fn(|_| rng.random()));
+                self.march(&group.rays[next].ray, rng.random(), &mut group.tile);
                 next += 1;
             }
-            *marched += tile.positions.len();
-            self.shade(tile, worker, backgrounds);
-            worker.d_sigma.clear();
-            worker.d_sigma.resize(tile.alphas.len(), 0.0);
-            worker.d_rgb.clear();
-            worker.d_rgb.resize(tile.alphas.len(), [0.0; 3]);
-            let mut start = 0;
-            for (i, target) in targets[first..next].iter().enumerate() {
-                let run = start..start + tile.runs[i].0 as usize;
-                start = run.end;
-                let wanted = match target.mask.filter(|_| self.options.object_only) {
-                    Some(mask) => std::array::from_fn(|c| mask * target.rgb[c] + (1.0 - mask) * backgrounds[i][c]),
-                    None => target.rgb,
-                };
-                let error: [f32; 3] = std::array::from_fn(|c| tile.composites[i].rgb[c] - wanted[c]);
-                *loss += error.iter().map(|e| f64::from(e * e)).sum::<f64>();
-                let gradient = CompositeGradient { d_rgb: error.map(|e| 2.0 * scale * e), d_transmittance: 0.0 };
-                composite_backward(
-                    &tile.alphas[run.clone()],
-                    &worker.rgb[run.clone()],
-                    backgrounds[i],
-                    &tile.weights[run.clone()],
-                    &tile.composites[i],
-                    &gradient,
-                    &mut worker.d_sigma[run.clone()],
-                    &mut worker.d_rgb[run],
-                );
+            group.marched += group.tile.positions.len();
+            self.shade(&mut group.tile, &mut group.field, &group.backgrounds, Some(&mut group.seen));
+            self.losses(group, first..next, scale);
+            let Group { field: worker, tile, gradients, .. } = group;
+            self.field.backward(&self.parameters, task.transposed, &tile.positions, worker);
+            if task.move_cameras {
+                self.field.ray_gradients(&self.parameters, &tile.positions, &tile.runs, worker);
+                let mut sample = 0;
+                for (target, ((count, _), d)) in
+                    group.rays[first..next].iter().zip(tile.runs.iter().zip(&worker.d_directions))
+                {
+                    let mut gradient = RayGradient { origin: [0.0; 3], direction: *d };
+                    for i in sample..sample + *count as usize {
+                        let t = tile.depths[i];
+                        gradient.add_point(t, contract_gradient(target.ray.at(t), worker.d_positions[i]));
+                    }
+                    sample += *count as usize;
+                    gradients.push(gradient);
+                }
             }
-            // d alpha / d sigma = dt (1 - alpha).
-            for ((d, alpha), dt) in worker.d_sigma.iter_mut().zip(&tile.alphas).zip(&tile.lengths) {
-                *d *= dt * (1.0 - alpha);
+        }
+    }
+
+    /// The losses of a tile's rays and their derivatives with respect to densities and colours.
+    fn losses(&self, group: &mut Group, range: std::ops::Range<usize>, scale: f32) {
+        let Group { field: worker, tile, rays, backgrounds, loss, distortion: distorted, .. } = group;
+        worker.d_sigma.clear();
+        worker.d_sigma.resize(tile.alphas.len(), 0.0);
+        worker.d_rgb.clear();
+        worker.d_rgb.resize(tile.alphas.len(), [0.0; 3]);
+        let (mut start, mut places, mut lengths) = (0, Vec::new(), Vec::new());
+        for (i, target) in rays[range].iter().enumerate() {
+            let run = start..start + tile.runs[i].0 as usize;
+            start = run.end;
+            let wanted = match target.mask.filter(|_| self.options.object_only) {
+                Some(mask) => std::array::from_fn(|c| mask * target.rgb[c] + (1.0 - mask) * backgrounds[i][c]),
+                None => target.rgb,
+            };
+            let error: [f32; 3] = std::array::from_fn(|c| tile.composites[i].rgb[c] - wanted[c]);
+            *loss += error.iter().map(|e| f64::from(e * e)).sum::<f64>();
+            let d_weights = &mut worker.d_sigma[run.clone()];
+            if self.options.distortion > 0.0 {
+                // Distances in units that shrink like disparity: s = t / (1 + t).
+                places.clear();
+                places.extend(tile.depths[run.clone()].iter().map(|t| t / (1.0 + t)));
+                lengths.clear();
+                let stretches = tile.depths[run.clone()].iter().zip(&tile.lengths[run.clone()]);
+                lengths.extend(stretches.map(|(t, dt)| dt / ((1.0 + t) * (1.0 + t))));
+                let weight = 3.0 * scale * self.options.distortion;
+                *distorted += f64::from(distortion(&tile.weights[run.clone()], &places, &lengths, weight, d_weights));
             }
-            self.field.backward(&self.parameters, transposed, &tile.positions, worker);
+            let gradient = CompositeGradient { d_rgb: error.map(|e| 2.0 * scale * e), d_transmittance: 0.0 };
+            composite_backward(
+                &tile.alphas[run.clone()],
+                &worker.rgb[run.clone()],
+                backgrounds[i],
+                &tile.weights[run.clone()],
+                &tile.composites[i],
+                &gradient,
+                d_weights,
+                &mut worker.d_rgb[run],
+            );
+        }
+        // d alpha / d sigma = dt (1 - alpha).
+        for ((d, alpha), dt) in worker.d_sigma.iter_mut().zip(&tile.alphas).zip(&tile.lengths) {
+            *d *= dt * (1.0 - alpha);
         }
     }
 
@@ -301,27 +363,39 @@ impl Model for Nerf {
         self.options.iterations
     }
 
-    fn step(&mut self, data: &RayDataset, step: u64) -> StepReport {
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport {
         let wanted = self.options.samples_per_step as f32 / self.samples_per_ray[0].max(1.0);
         let rays = (wanted as usize / GROUPS).clamp(8, 1024);
-        let scale = 1.0 / (3 * rays * GROUPS) as f32;
         let transposed = self.field.transpose(&self.parameters);
+        let move_cameras = cameras.wants_gradients(step);
+        let task = Task { data, cameras, transposed: &transposed, rays, move_cameras };
         let mut groups = std::mem::take(&mut self.groups);
         groups.par_iter_mut().enumerate().for_each(|(i, group)| {
             let mut rng = rng(self.options.seed, step * GROUPS as u64 + i as u64);
-            self.run_group(data, &mut rng, rays, scale, &transposed, group);
+            self.run_group(&task, &mut rng, group);
         });
         self.field.collect(&mut self.parameters, groups.iter_mut().map(|g| &mut g.field));
-        let mse = groups.iter().map(|g| g.loss).sum::<f64>() / (3 * rays * GROUPS) as f64;
+        let factor = self.options.schedule.factor(step + 1);
+        if move_cameras {
+            cameras.add(data, groups.iter().flat_map(|g| g.rays.iter().zip(&g.gradients)));
+            cameras.step(data, factor, step);
+        }
+        let n = (rays * GROUPS) as f64;
+        let mse = groups.iter().map(|g| g.loss).sum::<f64>() / (3.0 * n);
+        let distortion = groups.iter().map(|g| g.distortion).sum::<f64>() / n;
         let samples = groups.iter().map(|g| g.marched).sum::<usize>();
+        for group in &mut groups {
+            self.occupancy.raise(&group.seen);
+            group.seen.clear();
+        }
         self.groups = groups;
-        let lr = self.options.learning_rate * self.options.schedule.factor(step + 1);
-        self.parameters.step(lr, step + 1);
-        self.samples_per_ray[0] += 0.1 * (samples as f32 / (rays * GROUPS) as f32 - self.samples_per_ray[0]);
+        self.parameters.step(self.options.learning_rate * factor, step + 1);
+        self.samples_per_ray[0] += 0.1 * (samples as f32 / n as f32 - self.samples_per_ray[0]);
         if (step + 1).is_multiple_of(self.options.occupancy_every) {
             self.refresh_occupancy((step + 1) / self.options.occupancy_every);
         }
-        StepReport { loss: mse, mse, rays: rays * GROUPS, samples }
+        let loss = mse + f64::from(self.options.distortion) * distortion;
+        StepReport { loss, mse, rays: rays * GROUPS, samples }
     }
 
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
@@ -334,13 +408,13 @@ impl Model for Nerf {
                     self.march(ray, 0.5, &mut tile);
                     if tile.positions.len() >= TILE {
                         let black = vec![[0.0; 3]; tile.runs.len()];
-                        self.shade(&mut tile, &mut worker, &black);
+                        self.shade(&mut tile, &mut worker, &black, None);
                         out.extend(tile.composites.iter().map(|c| c.rgb));
                         Self::clear(&mut tile);
                     }
                 }
                 let black = vec![[0.0; 3]; tile.runs.len()];
-                self.shade(&mut tile, &mut worker, &black);
+                self.shade(&mut tile, &mut worker, &black, None);
                 out.extend(tile.composites.iter().map(|c| c.rgb));
                 out
             })
@@ -387,11 +461,15 @@ impl Model for Nerf {
         all
     }
 
-    fn restored(&mut self, step: u64) {
+    fn restored(&mut self, step: u64) -> Result<(), String> {
+        let mut lengths: Vec<usize> = self.parameters.lengths();
+        lengths.extend([self.options.occupancy.pow(3), 1]);
+        same_lengths(&self.buffers(), &lengths)?;
         let turn = step / self.options.occupancy_every;
         if turn > 0 {
             self.occupancy.decide(self.occupancy_threshold(turn));
         }
+        Ok(())
     }
 
     fn is_finite(&self) -> bool {
@@ -400,5 +478,10 @@ impl Model for Nerf {
 
     fn parameter_count(&self) -> usize {
         self.field.parameter_count()
+    }
+
+    fn bytes(&self) -> usize {
+        let o = &self.options;
+        16 * self.field.parameter_count() + 6 * o.occupancy.pow(3) + 2 * o.samples_per_step * self.field.bytes_per_sample()
     }
 }

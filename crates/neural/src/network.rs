@@ -106,6 +106,11 @@ impl Network {
         [&mut self.direct, &mut self.gains].into_iter().flat_map(|p| [&mut p.values, &mut p.m, &mut p.v]).collect()
     }
 
+    /// Lengths of the buffers.
+    pub fn lengths(&self) -> Vec<usize> {
+        [&self.direct, &self.gains].into_iter().flat_map(|p| [p.grads.len(); 3]).collect()
+    }
+
     /// Whether every parameter is a finite number.
     pub fn is_finite(&self) -> bool {
         self.direct.is_finite() && self.gains.is_finite()

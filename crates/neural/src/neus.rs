@@ -17,11 +17,12 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::adam::{AdamOptions, Parameters, Schedule};
+use crate::cameras::{CameraResiduals, RayGradient};
 use crate::composite::{Composite, CompositeGradient, composite, composite_backward, opacity};
-use crate::contraction::contract;
+use crate::contraction::{contract, contract_gradient};
 use crate::dataset::{RayDataset, SceneRay, TargetRay};
 use crate::hash_grid::HashGridOptions;
-use crate::model::{GROUPS, Level, Model, StepReport, TILE};
+use crate::model::{GROUPS, Level, Model, StepReport, TILE, same_lengths};
 use crate::neus_alpha::Section;
 use crate::occupancy::{CELL_MEMORY, OccupancyGrid, TURNS};
 use crate::radiance_field::{RadianceField, RadianceFieldOptions, RadianceParameters, RadianceWorker, Transposed};
@@ -146,9 +147,11 @@ impl NeusOptions {
 #[derive(Debug, Default)]
 struct Tile {
     inner: Vec<[f32; 3]>,
+    inner_t: Vec<f32>,
     inner_dt: Vec<f32>,
     inner_runs: Vec<(u32, [f32; 3])>,
     outer: Vec<[f32; 3]>,
+    outer_t: Vec<f32>,
     outer_dt: Vec<f32>,
     outer_runs: Vec<(u32, [f32; 3])>,
     keep: Vec<u32>,
@@ -163,9 +166,11 @@ struct Tile {
 impl Tile {
     fn clear(&mut self) {
         self.inner.clear();
+        self.inner_t.clear();
         self.inner_dt.clear();
         self.inner_runs.clear();
         self.outer.clear();
+        self.outer_t.clear();
         self.outer_dt.clear();
         self.outer_runs.clear();
     }
@@ -178,10 +183,25 @@ struct Group {
     tile: Tile,
     rays: Vec<TargetRay>,
     backgrounds: Vec<[f32; 3]>,
+    gradients: Vec<RayGradient>,
+    /// Cells of the background that were sampled, and the density found.
+    seen: Vec<(u32, f32)>,
+    d_cosines: Vec<f32>,
     loss: f64,
     squared: f64,
     marched: usize,
     d_sharpness: f32,
+}
+
+/// What a step asks of its groups.
+#[derive(Clone, Copy)]
+struct Task<'a> {
+    data: &'a RayDataset,
+    cameras: &'a CameraResiduals,
+    transposed: &'a Transposed,
+    rays: usize,
+    step: u64,
+    move_cameras: bool,
 }
 
 /// A NeuS in training.
@@ -212,11 +232,13 @@ impl Neus {
         let mut rng = rng(options.seed, u64::MAX);
         let field = SdfField::new(options.field.clone(), &mut rng);
         let outside = RadianceField::new(&options.background);
+        let mut outer_cells = OccupancyGrid::new(options.occupancy);
+        outer_cells.close(|center, half| data.seen_by(center, half, 0.5) >= 2);
         let mut neus = Self {
             outside_parameters: outside.init(&mut rng),
             sharpness: Parameters::new(vec![options.initial_sharpness]),
             inner_cells: OccupancyGrid::new(options.occupancy),
-            outer_cells: OccupancyGrid::new(options.occupancy),
+            outer_cells,
             samples_per_ray: vec![64.0],
             groups: (0..GROUPS).map(|_| Group::default()).collect(),
             with_masks: options.use_masks && data.has_masks(),
@@ -259,6 +281,7 @@ impl Neus {
                 let p = ray.at(t);
                 if self.inner_cells.is_occupied(p.map(|c| 0.5 * c + 0.5)) {
                     tile.inner.push(p);
+                    tile.inner_t.push(t);
                     tile.inner_dt.push(dt);
                 }
                 t += dt;
@@ -273,6 +296,7 @@ impl Neus {
                 let u = contract(ray.at(t));
                 if self.outer_cells.is_occupied(u) {
                     tile.outer.push(u);
+                    tile.outer_t.push(t);
                     tile.outer_dt.push(dt);
                 }
                 t += dt;
@@ -351,25 +375,20 @@ impl Neus {
             self.field.compact(&tile.keep, sdf);
             for (to, from) in tile.keep.iter().enumerate() {
                 tile.inner[to] = tile.inner[*from as usize];
+                tile.inner_t[to] = tile.inner_t[*from as usize];
                 tile.inner_dt[to] = tile.inner_dt[*from as usize];
             }
             tile.inner.truncate(tile.keep.len());
+            tile.inner_t.truncate(tile.keep.len());
             tile.inner_dt.truncate(tile.keep.len());
         }
     }
 
-    fn run_group(
-        &self,
-        data: &RayDataset,
-        rng: &mut Rng,
-        rays: usize,
-        step: u64,
-        transposed: &Transposed,
-        group: &mut Group,
-    ) {
-        let anneal = self.anneal(step);
-        data.draw(rng, rays, &mut group.rays);
+    fn run_group(&self, task: &Task<'_>, rng: &mut Rng, group: &mut Group) {
+        let (rays, anneal) = (task.rays, self.anneal(task.step));
+        task.data.draw(rng, rays, task.cameras, &mut group.rays);
         (group.loss, group.squared, group.marched, group.d_sharpness) = (0.0, 0.0, 0, 0.0);
+        group.gradients.clear();
         let mut next = 0;
         while next < group.rays.len() {
             let first = next;
@@ -382,16 +401,53 @@ impl Neus {
                 next += 1;
             }
             group.marched += group.tile.inner.len();
-            let Group { sdf, outside, tile, backgrounds, .. } = group;
+            let Group { sdf, outside, tile, backgrounds, seen, .. } = group;
             self.shade(tile, sdf, outside, backgrounds, anneal);
+            let cells = tile.outer.iter().map(|u| self.outer_cells.cell(*u) as u32);
+            seen.extend(cells.zip(outside.sigma.iter().copied()));
             self.losses(group, first..next, rays);
             self.send_back(group, anneal, rays);
             if !self.with_masks {
-                self.outside.backward(&self.outside_parameters, transposed, &group.tile.outer, &mut group.outside);
+                self.outside.backward(&self.outside_parameters, task.transposed, &group.tile.outer, &mut group.outside);
             }
             self.field.backward(&mut group.sdf);
+            if task.move_cameras {
+                self.ray_gradients(group, first..next);
+            }
         }
         self.free_points(rng, group);
+    }
+
+    /// What the losses ask of the tile's rays: through the samples' positions (their distances stay), the encoded
+    /// direction, and the cosine between direction and normal.
+    fn ray_gradients(&self, group: &mut Group, range: std::ops::Range<usize>) {
+        let Group { sdf, outside, tile, rays, gradients, d_cosines, .. } = group;
+        self.field.ray_gradients(&tile.inner_runs, sdf);
+        if !self.with_masks {
+            self.outside.ray_gradients(&self.outside_parameters, &tile.outer, &tile.outer_runs, outside);
+        }
+        let (mut inner, mut outer) = (0, 0);
+        for (ray, target) in rays[range].iter().enumerate() {
+            let mut gradient = RayGradient { origin: [0.0; 3], direction: sdf.d_directions[ray] };
+            for i in inner..inner + tile.inner_runs[ray].0 as usize {
+                gradient.add_point(tile.inner_t[i], sdf.d_positions[i]);
+                for d in 0..3 {
+                    gradient.direction[d] += d_cosines[i] * sdf.normals[i][d];
+                }
+            }
+            inner += tile.inner_runs[ray].0 as usize;
+            if !self.with_masks {
+                for d in 0..3 {
+                    gradient.direction[d] += outside.d_directions[ray][d];
+                }
+                for i in outer..outer + tile.outer_runs[ray].0 as usize {
+                    let t = tile.outer_t[i];
+                    gradient.add_point(t, contract_gradient(target.ray.at(t), outside.d_positions[i]));
+                }
+                outer += tile.outer_runs[ray].0 as usize;
+            }
+            gradients.push(gradient);
+        }
     }
 
     /// The loss of each ray, and its derivatives with respect to opacities and colours.
@@ -435,7 +491,8 @@ impl Neus {
     /// From opacities and colours back to distance, normal, sharpness, density; adds the eikonal loss.
     fn send_back(&self, group: &mut Group, anneal: f32, rays: usize) {
         let s = self.sharpness();
-        let Group { sdf, outside, tile, .. } = group;
+        let Group { sdf, outside, tile, d_cosines, .. } = group;
+        d_cosines.clear();
         let samples = rays as f32 * GROUPS as f32 * self.samples_per_ray[0].max(1.0);
         for d in [&mut sdf.d_rgb, &mut sdf.d_normals] {
             d.clear();
@@ -453,7 +510,9 @@ impl Neus {
                 group.d_sharpness += d_alpha * derivative.sharpness;
                 let (loss, pull) = eikonal(sdf.normals[i], self.options.eikonal / samples);
                 group.loss += f64::from(loss) * (rays * GROUPS) as f64;
-                sdf.d_normals.push(std::array::from_fn(|d| d_alpha * derivative.cosine * direction[d] + pull[d]));
+                let d_cosine = d_alpha * derivative.cosine;
+                sdf.d_normals.push(std::array::from_fn(|d| d_cosine * direction[d] + pull[d]));
+                d_cosines.push(d_cosine);
                 sdf.d_rgb.push(tile.d_rgb[at]);
                 at += 1;
             }
@@ -515,13 +574,13 @@ impl Neus {
     }
 }
 
-fn section(sdf: &SdfWorker, i: usize, dt: f32, direction: [f32; 3]) -> Section {
+pub(crate) fn section(sdf: &SdfWorker, i: usize, dt: f32, direction: [f32; 3]) -> Section {
     let n = sdf.normals[i];
     Section { sdf: sdf.sdf[i], cosine: n[0] * direction[0] + n[1] * direction[1] + n[2] * direction[2], dt }
 }
 
 /// `weight (|n| - 1)^2` and its derivative with respect to n.
-fn eikonal(n: [f32; 3], weight: f32) -> (f32, [f32; 3]) {
+pub(crate) fn eikonal(n: [f32; 3], weight: f32) -> (f32, [f32; 3]) {
     let norm = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt().max(1e-6);
     (weight * (norm - 1.0) * (norm - 1.0), n.map(|c| 2.0 * weight * (norm - 1.0) / norm * c))
 }
@@ -535,19 +594,25 @@ impl Model for Neus {
         self.options.iterations
     }
 
-    fn step(&mut self, data: &RayDataset, step: u64) -> StepReport {
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport {
         self.set_levels(step);
         let wanted = self.options.samples_per_step as f32 / self.samples_per_ray[0].max(1.0);
         let rays = (wanted as usize / GROUPS).clamp(8, 128);
         let transposed = self.outside.transpose(&self.outside_parameters);
+        let move_cameras = cameras.wants_gradients(step);
+        let task = Task { data, cameras, transposed: &transposed, rays, step, move_cameras };
         let mut groups = std::mem::take(&mut self.groups);
         groups.par_iter_mut().enumerate().for_each(|(i, group)| {
             let mut rng = rng(self.options.seed, step * GROUPS as u64 + i as u64);
-            self.run_group(data, &mut rng, rays, step, &transposed, group);
+            self.run_group(&task, &mut rng, group);
         });
         self.field.collect(groups.iter_mut().map(|g| &mut g.sdf));
         if !self.with_masks {
             self.outside.collect(&mut self.outside_parameters, groups.iter_mut().map(|g| &mut g.outside));
+        }
+        if move_cameras {
+            cameras.add(data, groups.iter().flat_map(|g| g.rays.iter().zip(&g.gradients)));
+            cameras.step(data, self.options.schedule.factor(step + 1), step);
         }
         let n = (rays * GROUPS) as f64;
         let loss = groups.iter().map(|g| g.loss).sum::<f64>() / n;
@@ -555,6 +620,10 @@ impl Model for Neus {
         let samples = groups.iter().map(|g| g.marched).sum::<usize>();
         // ds/dv = 10 s.
         self.sharpness.grads[0] = groups.iter().map(|g| g.d_sharpness).sum::<f32>() * 10.0 * self.sharpness();
+        for group in &mut groups {
+            self.outer_cells.raise(&group.seen);
+            group.seen.clear();
+        }
         self.groups = groups;
         let factor = self.options.schedule.factor(step + 1);
         let adam = AdamOptions { beta2: 0.99, epsilon: 1e-15, ..AdamOptions::default() };
@@ -601,13 +670,7 @@ impl Model for Neus {
     }
 
     fn surface(&self, positions: &[[f32; 3]]) -> Vec<f32> {
-        let mut worker = SdfWorker::default();
-        let mut out = Vec::with_capacity(positions.len());
-        for tile in positions.chunks(TILE) {
-            self.field.distance(tile, &mut worker);
-            out.extend_from_slice(&worker.sdf);
-        }
-        out
+        self.field.distances(positions)
     }
 
     fn may_cross(&self, low: [f32; 3], high: [f32; 3]) -> bool {
@@ -616,16 +679,7 @@ impl Model for Neus {
     }
 
     fn color_at(&self, positions: &[[f32; 3]], directions: &[[f32; 3]]) -> Vec<[f32; 3]> {
-        let mut worker = SdfWorker::default();
-        let mut out = Vec::with_capacity(positions.len());
-        for (positions, directions) in positions.chunks(TILE).zip(directions.chunks(TILE)) {
-            let runs: Vec<_> = directions.iter().map(|d| (1, *d)).collect();
-            self.field.distance(positions, &mut worker);
-            self.field.normals(&mut worker);
-            self.field.color(&runs, &mut worker);
-            out.extend_from_slice(&worker.rgb);
-        }
-        out
+        self.field.colors(positions, directions)
     }
 
     fn buffers(&mut self) -> Vec<&mut Vec<f32>> {
@@ -636,12 +690,18 @@ impl Model for Neus {
         all
     }
 
-    fn restored(&mut self, step: u64) {
+    fn restored(&mut self, step: u64) -> Result<(), String> {
+        let cells = self.options.occupancy.pow(3);
+        let mut lengths = self.field.lengths();
+        lengths.extend(self.outside_parameters.lengths());
+        lengths.extend([1, 1, 1, cells, cells, 1]);
+        same_lengths(&self.buffers(), &lengths)?;
         self.field.refresh();
         self.set_levels(step);
         if step >= self.options.occupancy_every {
             self.decide();
         }
+        Ok(())
     }
 
     fn is_finite(&self) -> bool {
@@ -651,5 +711,10 @@ impl Model for Neus {
     fn parameter_count(&self) -> usize {
         let outside = if self.with_masks { 0 } else { self.outside.parameter_count() };
         self.field.parameter_count() + outside + 1
+    }
+
+    fn bytes(&self) -> usize {
+        let o = &self.options;
+        16 * self.parameter_count() + 12 * o.occupancy.pow(3) + 2 * o.samples_per_step * self.field.bytes_per_sample()
     }
 }

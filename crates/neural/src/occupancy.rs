@@ -14,6 +14,8 @@ pub struct OccupancyGrid {
     /// Running maximum of the density; infinite before the first look.
     pub values: Vec<f32>,
     occupied: Vec<bool>,
+    /// Cells that no camera can say anything about: never occupied, never looked at.
+    closed: Vec<bool>,
 }
 
 /// A cell is refreshed in every sixteenth update.
@@ -28,7 +30,21 @@ impl OccupancyGrid {
     /// `resolution`^3 cells, all occupied.
     pub fn new(resolution: usize) -> Self {
         let cells = resolution.pow(3);
-        Self { resolution, values: vec![f32::INFINITY; cells], occupied: vec![true; cells] }
+        Self { resolution, values: vec![f32::INFINITY; cells], occupied: vec![true; cells], closed: vec![false; cells] }
+    }
+
+    /// Closes for good the cells that `keep` refuses, given centre and half edge in the unit cube: matter there would
+    /// only explain single photographs.
+    pub fn close(&mut self, keep: impl Fn([f32; 3], f32) -> bool + Sync) {
+        let r = self.resolution;
+        let half = 0.5 / r as f32;
+        let cells = self.closed.par_iter_mut().zip(&mut self.occupied).zip(&mut self.values).enumerate();
+        cells.for_each(|(i, ((closed, occupied), value))| {
+            let center = [i % r, i / r % r, i / (r * r)].map(|c| (c as f32 + 0.5) / r as f32);
+            if !keep(center, half) {
+                (*closed, *occupied, *value) = (true, false, 0.0);
+            }
+        });
     }
 
     /// Cells a side.
@@ -36,12 +52,27 @@ impl OccupancyGrid {
         self.resolution
     }
 
+    /// The cell around a point of the unit cube.
+    #[inline(always)]
+    pub fn cell(&self, p: [f32; 3]) -> usize {
+        let r = self.resolution;
+        let index = |v: f32| ((v * r as f32).max(0.0) as usize).min(r - 1);
+        (index(p[2]) * r + index(p[1])) * r + index(p[0])
+    }
+
     /// Whether the cell around a point of the unit cube may hold something.
     #[inline(always)]
     pub fn is_occupied(&self, p: [f32; 3]) -> bool {
-        let r = self.resolution;
-        let index = |v: f32| ((v * r as f32).max(0.0) as usize).min(r - 1);
-        self.occupied[(index(p[2]) * r + index(p[1])) * r + index(p[0])]
+        self.occupied[self.cell(p)]
+    }
+
+    /// Raises cells to what a step's samples found there: between two looks at a cell, which each ask for one point,
+    /// training itself has asked for hundreds, and a thin sheet is not forgotten.
+    pub fn raise(&mut self, seen: &[(u32, f32)]) {
+        for (cell, density) in seen {
+            let value = &mut self.values[*cell as usize];
+            *value = value.max(*density);
+        }
     }
 
     /// Whether a cell that touches a box of the unit cube may hold something.
@@ -50,6 +81,11 @@ impl OccupancyGrid {
         let index = |v: f32| ((v * r as f32).max(0.0) as usize).min(r - 1);
         let [x, y, z]: [std::ops::RangeInclusive<usize>; 3] = std::array::from_fn(|d| index(low[d])..=index(high[d]));
         z.into_iter().any(|z| y.clone().any(|y| x.clone().any(|x| self.occupied[(z * r + y) * r + x])))
+    }
+
+    /// The occupied cells, and the value of each.
+    pub fn occupied_cells(&self) -> impl Iterator<Item = (usize, f32)> + '_ {
+        self.values.iter().copied().enumerate().filter(|(i, _)| self.occupied[*i])
     }
 
     /// Share of the cells that are occupied.
@@ -72,7 +108,10 @@ impl OccupancyGrid {
         self.values.par_chunks_mut(PIECE).enumerate().for_each(|(piece, values)| {
             let mut rng = rng(seed, turn.wrapping_mul(1 << 20) + piece as u64);
             let cells: Vec<usize> =
-                (0..values.len()).filter(|i| all || (piece * PIECE + i) % TURNS as usize == offset).collect();
+                (0..values.len())
+                .filter(|i| !self.closed[piece * PIECE + i])
+                .filter(|i| all || (piece * PIECE + i) % TURNS as usize == offset)
+                .collect();
             let positions: Vec<[f32; 3]> = cells
                 .iter()
                 .map(|i| {
@@ -89,16 +128,17 @@ impl OccupancyGrid {
         });
     }
 
-    /// Mean of the cells that have been looked at; infinite before the first look.
+    /// Mean of the open cells that have been looked at; infinite before the first look.
     pub fn mean(&self) -> f32 {
-        let (sum, n) =
-            self.values.iter().filter(|v| v.is_finite()).fold((0.0, 0), |(s, n), v| (s + f64::from(*v), n + 1));
+        let open = self.values.iter().zip(&self.closed).filter(|(v, closed)| v.is_finite() && !**closed);
+        let (sum, n) = open.fold((0.0, 0), |(s, n), (v, _)| (s + f64::from(*v), n + 1));
         if n == 0 { f32::INFINITY } else { (sum / f64::from(n)) as f32 }
     }
 
     /// Marks the cells whose value exceeds the threshold.
     pub fn decide(&mut self, threshold: f32) {
-        self.occupied.par_iter_mut().zip(&self.values).for_each(|(o, v)| *o = *v > threshold);
+        let cells = self.occupied.par_iter_mut().zip(&self.values).zip(&self.closed);
+        cells.for_each(|((o, v), closed)| *o = *v > threshold && !closed);
     }
 }
 
@@ -127,5 +167,10 @@ mod tests {
             grid.decide(1.0);
         }
         assert_eq!(grid.share(), 0.0);
+        let mut half = OccupancyGrid::new(8);
+        half.close(|center, _| center[0] > 0.5);
+        half.update(0, 0, true, 0.0, |p, out| out.resize(p.len(), 1.0));
+        half.decide(0.5);
+        assert_eq!((half.share(), half.mean()), (0.5, 1.0));
     }
 }

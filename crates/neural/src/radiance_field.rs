@@ -9,7 +9,7 @@ use mb_job::Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::adam::{AdamOptions, Parameters};
-use crate::encoding::{HARMONICS, spherical_harmonics};
+use crate::encoding::{HARMONICS, harmonics_gradient, spherical_harmonics};
 use crate::hash_grid::{HashGrid, HashGridOptions, Scatter};
 use crate::mlp::{Activation, Mlp, MlpCache, MlpShape, Weights};
 use crate::simd::{dispatched, exp, padded, sigmoid};
@@ -73,6 +73,10 @@ pub struct RadianceWorker {
     pub d_sigma: Vec<f32>,
     /// To be filled before [`RadianceField::backward`].
     pub d_rgb: Vec<[f32; 3]>,
+    /// By [`RadianceField::ray_gradients`].
+    pub d_positions: Vec<[f32; 3]>,
+    /// By [`RadianceField::ray_gradients`].
+    pub d_directions: Vec<[f32; 3]>,
     d_out: Vec<f32>,
     density_grads: Vec<f32>,
     color_grads: Vec<f32>,
@@ -111,6 +115,11 @@ impl RadianceField {
     /// Number of parameters, padding not counted.
     pub fn parameter_count(&self) -> usize {
         self.grid.len() + self.density.parameter_count() + self.color.parameter_count()
+    }
+
+    /// Bytes that a step keeps of each sample until its scatter.
+    pub fn bytes_per_sample(&self) -> usize {
+        4 * self.stride() + 12
     }
 
     /// The transposed weights for a step.
@@ -221,6 +230,31 @@ impl RadianceField {
         worker.d_features.extend_from_slice(&worker.density.d_input[..rows * self.stride()]);
     }
 
+    /// After [`Self::backward`]: the derivatives with respect to the tile's positions (unit cube) and to the directions
+    /// of its rays, in `worker.d_positions` and `worker.d_directions`.
+    pub fn ray_gradients(
+        &self,
+        p: &RadianceParameters,
+        positions: &[[f32; 3]],
+        rays: &[(u32, [f32; 3])],
+        worker: &mut RadianceWorker,
+    ) {
+        worker.d_positions.clear();
+        worker.d_positions.resize(positions.len(), [0.0; 3]);
+        let (stride, d_features) = (self.stride(), &worker.density.d_input);
+        let levels = self.grid.levels();
+        self.grid.input_gradient(&p.table.values, positions, levels, d_features, stride, 0, &mut worker.d_positions);
+        worker.d_directions.clear();
+        let mut rows = worker.color.d_input.chunks_exact(self.color.in_stride());
+        for (count, direction) in rays {
+            let mut d = [0.0; 3];
+            for row in rows.by_ref().take(*count as usize) {
+                harmonics_gradient(*direction, &row[GEOMETRY..GEOMETRY + HARMONICS], &mut d);
+            }
+            worker.d_directions.push(d);
+        }
+    }
+
     /// Adds everything that the workers gathered to the parameters' gradients, in the workers' order, and clears it.
     pub fn collect<'a>(&self, p: &mut RadianceParameters, workers: impl Iterator<Item = &'a mut RadianceWorker>) {
         let workers: Vec<&mut RadianceWorker> = workers.collect();
@@ -257,6 +291,11 @@ impl RadianceParameters {
             .into_iter()
             .flat_map(|p| [&mut p.values, &mut p.m, &mut p.v])
             .collect()
+    }
+
+    /// Lengths of the buffers.
+    pub fn lengths(&self) -> Vec<usize> {
+        [&self.table, &self.density, &self.color].into_iter().flat_map(|p| [p.grads.len(); 3]).collect()
     }
 
     /// Whether every parameter is a finite number.
@@ -299,10 +338,10 @@ mod tests {
         let rays = [(2, [0.0, 0.6, 0.8]), (4, [1.0, 0.0, 0.0])];
         let d_sigma: Vec<f32> = (0..6).map(|_| rng.random_range(-1.0..1.0)).collect();
         let d_rgb: Vec<[f32; 3]> = (0..6).map(|_| std::array::from_fn(|_| rng.random_range(-1.0..1.0f32))).collect();
-        let loss = |p: &RadianceParameters| {
+        let loss = |p: &RadianceParameters, positions: &[[f32; 3]], rays: &[(u32, [f32; 3])]| {
             let mut w = RadianceWorker::default();
-            field.density(p, &positions, &mut w);
-            field.color(p, &rays, &mut w);
+            field.density(p, positions, &mut w);
+            field.color(p, rays, &mut w);
             let sigma: f64 = w.sigma.iter().zip(&d_sigma).map(|(a, b)| f64::from(a * b)).sum();
             sigma
                 + w.rgb
@@ -317,6 +356,24 @@ mod tests {
         (worker.d_sigma, worker.d_rgb) = (d_sigma.clone(), d_rgb.clone());
         field.backward(&p, &field.transpose(&p), &positions, &mut worker);
         field.collect(&mut p, std::iter::once(&mut worker));
+        field.ray_gradients(&p, &positions, &rays, &mut worker);
+        for (s, d) in [(0, 1), (3, 0), (5, 2)] {
+            let at = |h: f32| {
+                let mut positions = positions.clone();
+                positions[s][d] += h;
+                loss(&p, &positions, &rays)
+            };
+            let expected = (at(1e-3) - at(-1e-3)) / 2e-3;
+            let found = f64::from(worker.d_positions[s][d]);
+            assert!((found - expected).abs() < 0.02 * expected.abs().max(0.5), "{found} is not {expected}");
+            let at = |h: f32| {
+                let mut rays = rays;
+                rays[s / 3].1[d] += h;
+                loss(&p, &positions, &rays)
+            };
+            let (found, expected) = (f64::from(worker.d_directions[s / 3][d]), (at(1e-2) - at(-1e-2)) / 2e-2);
+            assert!((found - expected).abs() < 0.02 * expected.abs().max(0.5), "{found} is not {expected}");
+        }
         let buffers: [fn(&mut RadianceParameters) -> &mut Parameters; 3] =
             [|p| &mut p.table, |p| &mut p.density, |p| &mut p.color];
         for (b, buffer) in buffers.into_iter().enumerate() {
@@ -327,7 +384,7 @@ mod tests {
                 let at = |h: f32| {
                     let mut p = p.clone();
                     buffer(&mut p).values[i] += h;
-                    loss(&p)
+                    loss(&p, &positions, &rays)
                 };
                 let expected = (at(2e-3) - at(-2e-3)) / 4e-3;
                 // A step may cross a kink of ReLU; that is rare, and a wrong formula is not.

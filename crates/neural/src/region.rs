@@ -66,6 +66,13 @@ impl Region {
         if 2 * in_front < rays.len() {
             return Err(format!("the viewing rays meet behind {} of {} cameras", rays.len() - in_front, rays.len()));
         }
+        let shown = views.iter().filter(|view| shows(view, &center)).count();
+        if 2 * shown < views.len() {
+            return Err(format!(
+                "the photographs show no common place: the point nearest to all viewing rays is in {shown} of {} pictures",
+                views.len()
+            ));
+        }
         let mut radii: Vec<f64> = Vec::with_capacity(views.len());
         for view in views {
             let c = view.world_from_cam.inverse() * center;
@@ -110,6 +117,14 @@ impl Region {
     pub fn world_from_scene(&self, p_in_scene: &Point3<f64>) -> Point3<f64> {
         self.center + p_in_scene.coords * self.radius_m
     }
+}
+
+/// Whether a point of the world lies in a view's picture.
+fn shows(view: &View, p_in_world: &Point3<f64>) -> bool {
+    let size = view.size();
+    view.intrinsics.img_from_cam(&(view.world_from_cam.inverse() * *p_in_world)).is_some_and(|p| {
+        p.x >= -0.5 && p.y >= -0.5 && p.x < size.width as f64 - 0.5 && p.y < size.height as f64 - 0.5
+    })
 }
 
 /// The box around a view's mask, in pixels (z = 0); `None` where the mask is empty.

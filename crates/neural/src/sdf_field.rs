@@ -11,9 +11,10 @@ use mb_job::Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::adam::{AdamOptions, Parameters};
-use crate::encoding::{Frequencies, HARMONICS, spherical_harmonics};
+use crate::encoding::{Frequencies, HARMONICS, harmonics_gradient, spherical_harmonics};
 use crate::hash_grid::{HashGrid, HashGridOptions, Scatter};
 use crate::mlp::{Activation, Mlp, MlpCache, MlpShape, Skip};
+use crate::model::TILE;
 use crate::network::Network;
 use crate::radiance_field::{add, sigmoid_all};
 use crate::simd::padded;
@@ -121,6 +122,10 @@ pub struct SdfWorker {
     pub d_normals: Vec<[f32; 3]>,
     /// To be filled before [`SdfField::backward`]; empty where the colours were not computed.
     pub d_rgb: Vec<[f32; 3]>,
+    /// By [`SdfField::ray_gradients`].
+    pub d_positions: Vec<[f32; 3]>,
+    /// By [`SdfField::ray_gradients`].
+    pub d_directions: Vec<[f32; 3]>,
     d_out: Vec<f32>,
     d_gradient: Vec<f32>,
     geometry_grads: Vec<f32>,
@@ -220,6 +225,31 @@ impl SdfField {
         mlp.forward(self.geometry.weights().parameters, &worker.encoded, self.stride(), rows, &mut worker.geometry);
         worker.sdf.clear();
         worker.sdf.extend(worker.geometry.out.chunks_exact(mlp.out_stride()).map(|o| o[0]));
+    }
+
+    /// Signed distances of any number of points.
+    pub fn distances(&self, positions: &[[f32; 3]]) -> Vec<f32> {
+        let mut worker = SdfWorker::default();
+        let mut out = Vec::with_capacity(positions.len());
+        for tile in positions.chunks(TILE) {
+            self.distance(tile, &mut worker);
+            out.extend_from_slice(&worker.sdf);
+        }
+        out
+    }
+
+    /// Colours of any number of points, each seen along its (unit) direction.
+    pub fn colors(&self, positions: &[[f32; 3]], directions: &[[f32; 3]]) -> Vec<[f32; 3]> {
+        let mut worker = SdfWorker::default();
+        let mut out = Vec::with_capacity(positions.len());
+        for (positions, directions) in positions.chunks(TILE).zip(directions.chunks(TILE)) {
+            let runs: Vec<_> = directions.iter().map(|d| (1, *d)).collect();
+            self.distance(positions, &mut worker);
+            self.normals(&mut worker);
+            self.color(&runs, &mut worker);
+            out.extend_from_slice(&worker.rgb);
+        }
+        out
     }
 
     /// Keeps the samples that `keep` names (ascending) of a tile whose distance has been computed.
@@ -331,13 +361,60 @@ impl SdfField {
             &worker.d_out,
             Some(&worker.d_gradient),
             &mut worker.geometry_grads,
-            self.grid.is_some(),
+            true,
         );
         if self.grid.is_some() {
             worker.gathered.units.extend_from_slice(&worker.units);
             worker.gathered.d_features.extend_from_slice(&worker.geometry.d_input[..rows * stride]);
             worker.gathered.gradient.extend_from_slice(&worker.geometry.gradient[..rows * stride]);
         }
+    }
+
+    /// After [`Self::backward`]: the derivatives with respect to the tile's positions and to the directions of its rays,
+    /// in `worker.d_positions` and `worker.d_directions`. With `dn` the whole derivative on the normals, a position hears
+    /// through the encoding, `J^T de`, through the normal's own dependence on it, and from the colour network.
+    pub fn ray_gradients(&self, rays: &[(u32, [f32; 3])], worker: &mut SdfWorker) {
+        let (rows, stride) = (worker.sdf.len(), self.stride());
+        let mut to = vec![[0.0; 3]; rows];
+        let (d_input, gradient) = (&worker.geometry.d_input, &worker.geometry.gradient);
+        match &self.grid {
+            Some(grid) => {
+                let (table, levels) = (&self.table.values, self.active_levels);
+                let halves: Vec<[f32; 3]> = worker.d_normals.iter().map(|n| n.map(|c| 0.5 * c)).collect();
+                grid.input_gradient(table, &worker.units, levels, d_input, stride, 3, &mut to);
+                grid.second_gradient(table, &worker.units, levels, gradient, &halves, stride, 3, &mut to);
+                for (to, row) in to.iter_mut().zip(d_input.chunks_exact(stride)) {
+                    *to = std::array::from_fn(|d| 0.5 * to[d] + row[d]);
+                }
+            }
+            None => {
+                self.frequencies.input_gradient(&worker.encoded, d_input, stride, 0, &mut to);
+                self.frequencies.second_gradient(&worker.encoded, gradient, &worker.d_normals, stride, 0, &mut to);
+            }
+        }
+        worker.d_directions.clear();
+        let mut color = worker.color.d_input.chunks_exact(self.color.mlp().in_stride()).zip(&mut to);
+        let mut encoded = vec![0.0; self.directions];
+        for (count, direction) in rays {
+            let mut d = [[0.0; 3]];
+            if let DirectionEncoding::Frequencies(octaves) = self.options.direction {
+                Frequencies(octaves).forward(&[*direction], &mut encoded, self.directions, 0);
+            }
+            for (row, to) in color.by_ref().take(*count as usize) {
+                for i in 0..3 {
+                    to[i] += row[i];
+                }
+                let g = &row[6..6 + self.directions];
+                match self.options.direction {
+                    DirectionEncoding::Harmonics => harmonics_gradient(*direction, g, &mut d[0]),
+                    DirectionEncoding::Frequencies(octaves) => {
+                        Frequencies(octaves).input_gradient(&encoded, g, self.directions, 0, &mut d);
+                    }
+                }
+            }
+            worker.d_directions.push(d[0]);
+        }
+        worker.d_positions = to;
     }
 
     /// The colour network's part: fills the features' columns of `d_out` and adds to `d_normals`.
@@ -420,6 +497,19 @@ impl SdfField {
         all
     }
 
+    /// Lengths of the buffers.
+    pub fn lengths(&self) -> Vec<usize> {
+        let mut all = vec![self.table.grads.len(); 3];
+        all.extend(self.geometry.lengths());
+        all.extend(self.color.lengths());
+        all
+    }
+
+    /// Bytes that a step keeps of each sample until its scatter.
+    pub fn bytes_per_sample(&self) -> usize {
+        8 * self.stride() + 24
+    }
+
     /// Works out what follows from the parameters.
     pub fn refresh(&mut self) {
         self.geometry.refresh();
@@ -480,22 +570,23 @@ mod tests {
                 || (0..5).map(|_| std::array::from_fn(|_| rng.random_range(-1.0..1.0f32))).collect::<Vec<[f32; 3]>>();
             let (d_normals, d_rgb, more) = (threes(), threes(), threes());
             let d_sdf: Vec<f32> = more.iter().map(|v| v[0]).collect();
-            let forward = |field: &SdfField| {
+            let forward = |field: &SdfField, positions: &[[f32; 3]], rays: &[(u32, [f32; 3])]| {
                 let mut w = SdfWorker::default();
-                field.distance(&positions, &mut w);
+                field.distance(positions, &mut w);
                 field.normals(&mut w);
-                field.color(&rays, &mut w);
+                field.color(rays, &mut w);
                 w
             };
-            let loss = |field: &SdfField| {
-                let w = forward(field);
+            let loss_at = |field: &SdfField, positions: &[[f32; 3]], rays: &[(u32, [f32; 3])]| {
+                let w = forward(field, positions, rays);
                 let dot = |a: &[[f32; 3]], b: &[[f32; 3]]| {
                     a.iter().flatten().zip(b.iter().flatten()).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>()
                 };
                 let sdf: f64 = w.sdf.iter().zip(&d_sdf).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum();
                 sdf + dot(&w.normals, &d_normals) + dot(&w.rgb, &d_rgb)
             };
-            let mut worker = forward(&field);
+            let loss = |field: &SdfField| loss_at(field, &positions, &rays);
+            let mut worker = forward(&field, &positions, &rays);
             // The normal is the gradient of the distance.
             for (s, p) in positions.iter().enumerate() {
                 for d in 0..3 {
@@ -515,6 +606,23 @@ mod tests {
             }
             (worker.d_sdf, worker.d_normals, worker.d_rgb) = (d_sdf.clone(), d_normals.clone(), d_rgb.clone());
             field.backward(&mut worker);
+            field.ray_gradients(&rays, &mut worker);
+            for (s, d) in [(0, 1), (1, 0), (3, 2), (4, 0)] {
+                let at = |h: f32| {
+                    let mut positions = positions.clone();
+                    positions[s][d] += h;
+                    loss_at(&field, &positions, &rays)
+                };
+                let (found, expected) = (f64::from(worker.d_positions[s][d]), (at(1e-3) - at(-1e-3)) / 2e-3);
+                assert!((found - expected).abs() < 0.02 * expected.abs().max(0.5), "position: {found} is not {expected}");
+                let at = |h: f32| {
+                    let mut rays = rays;
+                    rays[s / 3].1[d] += h;
+                    loss_at(&field, &positions, &rays)
+                };
+                let (found, expected) = (f64::from(worker.d_directions[s / 3][d]), (at(1e-2) - at(-1e-2)) / 2e-2);
+                assert!((found - expected).abs() < 0.02 * expected.abs().max(0.5), "direction: {found} is not {expected}");
+            }
             field.collect(std::iter::once(&mut worker));
             // One step of plain descent along each buffer must change the loss as the derivative says.
             let before = field.clone();

@@ -1,16 +1,19 @@
-//! Training: progress, checkpoints, exact resume, divergence.
+//! Training: progress, previews, exact resume, bounded memory, divergence.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use mb_geometry::ImageSize;
 use mb_image::{Image, RgbImage};
-use mb_job::{Error, InputError, Progress, Result, write_atomic_with};
+use mb_job::{Error, Progress, Result};
 use serde::{Deserialize, Serialize};
 
+use crate::cameras::CameraResiduals;
+use crate::checkpoint;
 use crate::dataset::{RayDataset, View};
 use crate::model::{Model, StepReport};
 
-/// How a run is kept.
+/// How a run is kept, watched and bounded.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RunOptions {
@@ -21,11 +24,25 @@ pub struct RunOptions {
     pub checkpoint_every: u64,
     /// Steps between points of the loss curve.
     pub report_every: u64,
+    /// Folder for preview pictures of one view, beside its photograph; `None` paints none.
+    pub previews: Option<PathBuf>,
+    /// Steps between previews.
+    pub preview_every: u64,
+    /// Largest memory of photographs, parameters and work buffers together, MiB. A run that would need more is refused
+    /// before it starts.
+    pub memory_mib: usize,
 }
 
 impl Default for RunOptions {
     fn default() -> Self {
-        Self { checkpoint: None, checkpoint_every: 1000, report_every: 100 }
+        Self {
+            checkpoint: None,
+            checkpoint_every: 1000,
+            report_every: 100,
+            previews: None,
+            preview_every: 500,
+            memory_mib: 6144,
+        }
     }
 }
 
@@ -57,8 +74,21 @@ pub struct TrainSummary {
     pub steps: u64,
     /// Wall time of this run.
     pub seconds: f64,
+    /// Root mean square of what the cameras were corrected by; where they were.
+    pub cameras: Option<CameraChange>,
     /// The loss curve.
     pub curve: Vec<CurvePoint>,
+}
+
+/// How far corrected cameras moved, root mean square.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct CameraChange {
+    /// Turned by, degrees.
+    pub rotation_deg: f64,
+    /// Centre moved by, millimetres of the sequence's world.
+    pub center_mm: f64,
+    /// Focal length, per cent.
+    pub focal_percent: f64,
 }
 
 /// Peak signal-to-noise ratio of a mean squared error of values in 0..=1.
@@ -66,40 +96,31 @@ pub fn psnr_db(mse: f64) -> f64 {
     -10.0 * mse.max(1e-12).log10()
 }
 
-const MAGIC: &[u8; 16] = b"mb-neural ckpt 1";
-
-#[derive(Debug, Serialize, Deserialize, PartialEq)]
-struct CheckpointHeader {
-    method: String,
-    options: serde_json::Value,
-    data: u64,
-    step: u64,
-    lengths: Vec<usize>,
-}
-
 /// Trains `model` on `data` to the end, or until the person asks for a stop (then the checkpoint is saved).
 /// `options_json` are the resolved options, which a checkpoint must agree with.
 ///
 /// # Errors
-/// [`Error::Stopped`]; a checkpoint of another run; training diverged (the last checkpoint is kept).
+/// [`Error::Stopped`]; too little memory; a checkpoint of another run; training diverged (the last checkpoint is kept).
 pub fn train(
     model: &mut dyn Model,
     data: &RayDataset,
+    cameras: &mut CameraResiduals,
     options_json: &serde_json::Value,
     run: &RunOptions,
     progress: &dyn Progress,
 ) -> Result<TrainSummary> {
     let total = model.iterations();
-    let header = |model: &mut dyn Model, step| CheckpointHeader {
-        method: model.name().to_owned(),
-        options: options_json.clone(),
-        data: data.fingerprint(),
-        step,
-        lengths: model.buffers().iter().map(|b| b.len()).collect(),
-    };
-    let expected = header(model, 0);
+    check_memory(model, data, run)?;
+    let header = checkpoint::Header::new(model.name(), options_json, data.fingerprint());
     let mut step = match &run.checkpoint {
-        Some(path) if path.exists() => read_checkpoint(path, &expected, model)?,
+        Some(path) if path.exists() => {
+            let mut buffers = model.buffers();
+            buffers.extend(cameras.buffers());
+            let step = checkpoint::read(path, &header, buffers)?;
+            model.restored(step).map_err(|found| checkpoint::other(path, &found))?;
+            cameras.restored(data).map_err(|found| checkpoint::other(path, &found))?;
+            step
+        }
         _ => 0,
     };
     let first_step = step;
@@ -110,7 +131,7 @@ pub fn train(
     let mut what = format!("training {}", model.name());
     progress.report(&what, step as usize, total as usize);
     while step < total {
-        let report = model.step(data, step);
+        let report = model.step(data, cameras, step);
         step += 1;
         window.add(&report);
         let point_due = step.is_multiple_of(run.report_every.max(1)) || step == total;
@@ -146,7 +167,14 @@ pub fn train(
         if let Some(path) = &run.checkpoint
             && (stop || step == total || step.is_multiple_of(run.checkpoint_every.max(1)))
         {
-            write_checkpoint(path, &header(model, step), model)?;
+            let mut buffers = model.buffers();
+            buffers.extend(cameras.buffers());
+            checkpoint::write(path, &header, step, &buffers)?;
+        }
+        if let Some(folder) = &run.previews
+            && (step == total || step.is_multiple_of(run.preview_every.max(1)))
+        {
+            write_preview(folder, model, data, cameras, step)?;
         }
         if stop && step < total {
             return Err(Error::Stopped);
@@ -158,8 +186,48 @@ pub fn train(
         first_step,
         steps: step,
         seconds: clock.elapsed().as_secs_f64(),
+        cameras: cameras.size().map(|[rotation_deg, center, log_focal]| CameraChange {
+            rotation_deg,
+            center_mm: 1e3 * center * data.region().radius_m,
+            focal_percent: 100.0 * log_focal,
+        }),
         curve,
     })
+}
+
+/// Parameters with their gradients and both moments, and about a gradient of the networks and a list of samples for
+/// each worker, which are small beside them.
+fn check_memory(model: &dyn Model, data: &RayDataset, run: &RunOptions) -> Result<()> {
+    let mib = |bytes: usize| bytes.div_ceil(1 << 20);
+    let (photographs, parameters) = (mib(data.bytes()), mib(model.bytes()));
+    if photographs + parameters <= run.memory_mib {
+        return Ok(());
+    }
+    Err(Error::Failed(format!(
+        "training {} would need {} MiB ({photographs} for the photographs, {parameters} for the parameters and samples), \
+         and {} MiB are allowed: reduce the photographs (--max-side), choose a smaller preset, or allow more (--memory)",
+        model.name(),
+        photographs + parameters,
+        run.memory_mib
+    )))
+}
+
+/// One view beside its photograph: a held-out one where there is one, the first otherwise.
+fn write_preview(
+    folder: &Path,
+    model: &dyn Model,
+    data: &RayDataset,
+    cameras: &CameraResiduals,
+    step: u64,
+) -> Result<()> {
+    let index = data.views().iter().position(|v| v.held_out).unwrap_or(0);
+    let view = &data.views()[index];
+    let image = render_view(model, view, index, cameras);
+    let (width, height) = (view.size().width, view.size().height);
+    let pair = Image::from_fn(ImageSize::new(2 * width, height), |x, y| {
+        if x < width { image[(x, y)] } else { view.rgb[(x - width, y)] }
+    });
+    mb_image::write_rgb_png(folder.join(format!("step_{step:07}.png")), &pair)
 }
 
 fn time(seconds: f64) -> String {
@@ -206,56 +274,24 @@ impl Window {
     }
 }
 
-fn write_checkpoint(path: &Path, header: &CheckpointHeader, model: &mut dyn Model) -> Result<()> {
-    let json = serde_json::to_vec(header).map_err(|e| Error::write(path, e.into()))?;
-    write_atomic_with(path, |out| {
-        out.write_all(MAGIC)?;
-        out.write_all(&(json.len() as u64).to_le_bytes())?;
-        out.write_all(&json)?;
-        for buffer in model.buffers() {
-            for piece in buffer.chunks(4096) {
-                let bytes: Vec<u8> = piece.iter().flat_map(|v| v.to_le_bytes()).collect();
-                out.write_all(&bytes)?;
-            }
-        }
-        out.flush()
-    })
+/// Renders a view at its working size, from its corrected camera.
+pub fn render_view(model: &dyn Model, view: &View, index: usize, cameras: &CameraResiduals) -> RgbImage {
+    let size = view.size();
+    let rays: Vec<_> = (0..size.pixels())
+        .map(|i| cameras.ray(view, index, [(i % size.width) as f32, (i / size.width) as f32]))
+        .collect();
+    image_of(size, &model.render(&rays))
 }
 
-fn read_checkpoint(path: &Path, expected: &CheckpointHeader, model: &mut dyn Model) -> Result<u64> {
-    let bytes = std::fs::read(path).map_err(|e| InputError::unreadable(path, &e))?;
-    let other = |found: &str| InputError::new(path, found).help("Remove it, or name another checkpoint");
-    let rest = bytes.strip_prefix(MAGIC).ok_or_else(|| other("not a checkpoint of this program"))?;
-    let truncated = || other("the checkpoint is truncated");
-    let (length, rest) = rest.split_first_chunk::<8>().ok_or_else(truncated)?;
-    let length =
-        usize::try_from(u64::from_le_bytes(*length)).ok().filter(|n| *n <= rest.len()).ok_or_else(truncated)?;
-    let header: CheckpointHeader =
-        serde_json::from_slice(&rest[..length]).map_err(|e| other(&format!("damaged header ({e})")))?;
-    if header.method != expected.method || header.options != expected.options || header.lengths != expected.lengths {
-        return Err(other("the checkpoint belongs to a run with other options").into());
-    }
-    if header.data != expected.data {
-        return Err(other("the checkpoint belongs to other photographs or cameras").into());
-    }
-    let mut numbers = rest[length..].chunks_exact(4);
-    if numbers.len() != header.lengths.iter().sum::<usize>() {
-        return Err(truncated().into());
-    }
-    for buffer in model.buffers() {
-        for (to, from) in buffer.iter_mut().zip(&mut numbers) {
-            *to = f32::from_le_bytes([from[0], from[1], from[2], from[3]]);
-        }
-    }
-    model.restored(header.step);
-    Ok(header.step)
-}
-
-/// Renders a view at its working size.
-pub fn render_view(model: &dyn Model, view: &View) -> RgbImage {
+/// Renders a view that has no photograph.
+pub fn render_new_view(model: &dyn Model, view: &View) -> RgbImage {
     let size = view.size();
     let rays: Vec<_> = (0..size.pixels()).map(|i| view.ray((i % size.width) as f32, (i / size.width) as f32)).collect();
-    let colors = model.render(&rays);
+    image_of(size, &model.render(&rays))
+}
+
+/// A picture from its colours, row by row.
+fn image_of(size: ImageSize, colors: &[[f32; 3]]) -> RgbImage {
     Image::from_fn(size, |x, y| colors[y * size.width + x].map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8))
 }
 

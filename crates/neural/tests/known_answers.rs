@@ -3,15 +3,21 @@
 use mb_geometry::{Camera, ImageSize, Intrinsics, Rigid3, World};
 use mb_image::Image;
 use mb_job::{Error, Progress, Silent};
+use mb_neural::camera_path::CameraPath;
+use mb_neural::cameras::{CameraOptions, CameraResiduals};
 use mb_neural::dataset::{Photograph, RayDataset};
+use mb_neural::dvgo::{Dvgo, DvgoOptions};
 use mb_neural::extract::{SurfaceOptions, extract};
+use mb_neural::frequency_field::{DensityActivation, FrequencyFieldOptions};
 use mb_neural::hash_grid::HashGridOptions;
 use mb_neural::model::Model;
 use mb_neural::nerf::{Nerf, NerfOptions};
+use mb_neural::nerf_original::{NerfOriginal, NerfOriginalOptions};
 use mb_neural::neus::{Neus, NeusOptions};
+use mb_neural::neus_original::{NeusOriginal, NeusOriginalOptions};
 use mb_neural::sdf_field::PositionEncoding;
-use mb_neural::trainer::{RunOptions, train};
-use mb_neural::{FieldOptions, Method, reconstruct, synthesize};
+use mb_neural::trainer::{RunOptions, TrainSummary, train};
+use mb_neural::{FieldOptions, Method, Views, reconstruct, synthesize};
 use nalgebra::{Matrix3, Point2, Point3, Rotation3, UnitQuaternion, Vector3};
 
 const CENTER: Vector3<f64> = Vector3::new(0.4, -0.2, 1.0);
@@ -90,12 +96,24 @@ fn small_neus() -> NeusOptions {
     options.with_iterations(800)
 }
 
+/// Trains without correcting cameras.
+fn run(
+    model: &mut dyn Model,
+    data: &RayDataset,
+    json: &serde_json::Value,
+    options: &RunOptions,
+    progress: &dyn Progress,
+) -> mb_job::Result<TrainSummary> {
+    let mut cameras = CameraResiduals::new(&CameraOptions::default(), data);
+    train(model, data, &mut cameras, json, options, progress)
+}
+
 fn surface_of(photographs: Vec<Photograph>) -> mb_mesh::TriangleMesh {
     let data = RayDataset::from_images(photographs, 0).expect("20 good views");
     let options = small_neus();
     let json = serde_json::to_value(&options).expect("plain data");
     let mut neus = Neus::new(options, &data);
-    train(&mut neus, &data, &json, &RunOptions::default(), &Silent).expect("it converges");
+    run(&mut neus, &data, &json, &RunOptions::default(), &Silent).expect("it converges");
     extract(&neus, &data, &SurfaceOptions { voxel_mm: 2.0, cull: true }, &Silent).expect("a surface")
 }
 
@@ -169,52 +187,124 @@ fn small_nerf() -> NerfOptions {
     options.with_iterations(12)
 }
 
-/// Every parameter after a run.
-fn state(mut model: impl Model) -> Vec<f32> {
-    model.buffers().into_iter().flat_map(|b| b.clone()).collect()
+fn small_dvgo() -> DvgoOptions {
+    let mut options = DvgoOptions { rays: 256, ..DvgoOptions::fast() };
+    options.coarse.voxels = 16 * 16 * 16;
+    options.fine.voxels = 24 * 24 * 24;
+    options.network.width = 16;
+    options.grow = vec![1, 3];
+    options.coarse.iterations = 5;
+    options.fine.iterations = 7;
+    options
+}
+
+fn small_field() -> FrequencyFieldOptions {
+    FrequencyFieldOptions { width: 16, hidden: 2, skip: 1, head_width: 16, ..FrequencyFieldOptions::PAPER }
+}
+
+fn small_original_nerf() -> NerfOriginalOptions {
+    let paper = NerfOriginalOptions::paper().with_iterations(8);
+    NerfOriginalOptions { rays: 64, coarse_samples: 8, fine_samples: 8, field: small_field(), ..paper }
+}
+
+fn small_original_neus() -> NeusOriginalOptions {
+    let mut options = NeusOriginalOptions::paper().with_iterations(8);
+    options.rays = 64;
+    (options.samples, options.importance, options.outside) = (8, 8, 4);
+    (options.field.width, options.field.hidden, options.field.skip) = (56, 2, Some(1));
+    (options.field.features, options.field.color_width, options.field.color_hidden) = (8, 16, 1);
+    options.background = FrequencyFieldOptions { activation: DensityActivation::Softplus, ..small_field() };
+    options
+}
+
+/// Every method, small, and a step in the middle of its run.
+fn every_method(data: &RayDataset) -> Vec<(Box<dyn Model>, usize)> {
+    vec![
+        (Box::new(Nerf::new(small_nerf(), data)), 7),
+        (Box::new(Neus::new(small_neus().with_iterations(8), data)), 5),
+        // Once before and once after the second growth of the fine stage.
+        (Box::new(Dvgo::new(small_dvgo(), data)), 4),
+        (Box::new(Dvgo::new(small_dvgo(), data)), 9),
+        (Box::new(NerfOriginal::new(small_original_nerf(), data)), 3),
+        (Box::new(NeusOriginal::new(small_original_neus(), data)), 3),
+    ]
+}
+
+/// Every parameter after a run, cameras included.
+fn state(model: &mut dyn Model, cameras: &mut CameraResiduals) -> Vec<f32> {
+    let mut all: Vec<f32> = model.buffers().into_iter().flat_map(|b| b.clone()).collect();
+    all.extend(cameras.buffers().into_iter().flat_map(|b| b.clone()));
+    all
+}
+
+/// With and without masks, for cameras that are corrected.
+#[test]
+fn a_stopped_and_resumed_run_ends_with_the_same_bytes_for_any_thread_count() {
+    let correcting = CameraOptions { refine_poses: true, refine_focal: true, start: 1, ..CameraOptions::default() };
+    for with_masks in [true, false] {
+        let images =
+            photographs(4, ball(0.06)).into_iter().map(|(rgb, mask, k, pose)| (rgb, mask.filter(|_| with_masks), k, pose));
+        let data = RayDataset::from_images(images.collect(), 0).expect("4 good views");
+        let json = serde_json::json!({"run": 1});
+        let straight = |threads: usize| -> Vec<Vec<f32>> {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+            pool.install(|| {
+                every_method(&data)
+                    .into_iter()
+                    .map(|(mut model, _)| {
+                        let mut cameras = CameraResiduals::new(&correcting, &data);
+                        train(model.as_mut(), &data, &mut cameras, &json, &RunOptions::default(), &Silent)
+                            .expect("it runs");
+                        assert!(cameras.size().expect("they are corrected").iter().all(|v| *v > 0.0));
+                        state(model.as_mut(), &mut cameras)
+                    })
+                    .collect()
+            })
+        };
+        let (one, three) = (straight(1), straight(3));
+        assert!(one == three, "the thread count changes the result");
+
+        let dir = tempfile::tempdir().expect("a folder");
+        for (i, (mut model, at)) in every_method(&data).into_iter().enumerate() {
+            let path = dir.path().join(i.to_string());
+            let kept = RunOptions { checkpoint: Some(path.clone()), ..RunOptions::default() };
+            let mut cameras = CameraResiduals::new(&correcting, &data);
+            CALLS.with(|calls| calls.set(0));
+            let stopped = train(model.as_mut(), &data, &mut cameras, &json, &kept, &StopAt(at));
+            assert!(matches!(stopped, Err(Error::Stopped)), "{stopped:?}");
+            let (mut again, _) = every_method(&data).swap_remove(i);
+            let mut cameras = CameraResiduals::new(&correcting, &data);
+            let summary = train(again.as_mut(), &data, &mut cameras, &json, &kept, &Silent).expect("it resumes");
+            assert_eq!(summary.first_step, at as u64);
+            assert!(state(again.as_mut(), &mut cameras) == one[i], "{} differs after a resume", again.name());
+            let other = run(again.as_mut(), &data, &serde_json::json!({"run": 2}), &kept, &Silent);
+            assert!(other.expect_err("other options").to_string().contains("other options"));
+            // A damaged checkpoint is told, not read.
+            let bytes = std::fs::read(&path).expect("the checkpoint");
+            for cut in [3, 20, bytes.len() / 2] {
+                std::fs::write(&path, &bytes[..cut]).expect("a shorter file");
+                assert!(matches!(run(again.as_mut(), &data, &json, &kept, &Silent), Err(Error::Input(_))));
+            }
+        }
+    }
 }
 
 #[test]
-fn a_stopped_and_resumed_run_ends_with_the_same_bytes_for_any_thread_count() {
-    let data = RayDataset::from_images(photographs(4, ball(0.06)), 0).expect("4 good views");
-    let json = serde_json::json!({"run": 1});
-    let on = |threads: usize, job: &(dyn Fn() -> (Vec<f32>, Vec<f32>) + Sync)| {
-        rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool").install(job)
-    };
-    let straight = || {
-        let (mut nerf, mut neus) = (Nerf::new(small_nerf()), Neus::new(small_neus().with_iterations(8), &data));
-        train(&mut nerf, &data, &json, &RunOptions::default(), &Silent).expect("it runs");
-        train(&mut neus, &data, &json, &RunOptions::default(), &Silent).expect("it runs");
-        (state(nerf), state(neus))
-    };
-    let (one, three) = (on(1, &straight), on(3, &straight));
-    assert!(one == three, "the thread count changes the result");
+fn a_run_that_would_need_too_much_memory_is_refused_before_it_starts() {
+    let data = RayDataset::from_images(photographs(3, ball(0.06)), 0).expect("3 good views");
+    let mut nerf = Nerf::new(small_nerf(), &data);
+    let options = RunOptions { memory_mib: 0, ..RunOptions::default() };
+    let error = run(&mut nerf, &data, &serde_json::Value::Null, &options, &Silent).expect_err("no memory").to_string();
+    assert!(error.contains("--memory"), "{error}");
+}
 
-    let dir = tempfile::tempdir().expect("a folder");
-    let interrupted = |model: &dyn Fn() -> Box<dyn Model>, name: &str, at: usize| {
-        let run = RunOptions { checkpoint: Some(dir.path().join(name)), ..RunOptions::default() };
-        CALLS.with(|calls| calls.set(0));
-        let stopped = train(model().as_mut(), &data, &json, &run, &StopAt(at));
-        assert!(matches!(stopped, Err(Error::Stopped)), "{stopped:?}");
-        let mut again = model();
-        let summary = train(again.as_mut(), &data, &json, &run, &Silent).expect("it resumes");
-        assert_eq!(summary.first_step, at as u64);
-        let other = train(model().as_mut(), &data, &serde_json::json!({"run": 2}), &run, &Silent);
-        assert!(other.expect_err("other options").to_string().contains("other options"));
-        again.buffers().into_iter().flat_map(|b| b.clone()).collect::<Vec<f32>>()
-    };
-    assert!(interrupted(&|| Box::new(Nerf::new(small_nerf())), "nerf", 7) == one.0, "nerf differs after a resume");
-    let neus = || -> Box<dyn Model> { Box::new(Neus::new(small_neus().with_iterations(8), &data)) };
-    assert!(interrupted(&neus, "neus", 5) == one.1, "neus differs after a resume");
-
-    // A damaged checkpoint is told, not read.
-    let path = dir.path().join("nerf");
-    let bytes = std::fs::read(&path).expect("the checkpoint");
-    for cut in [3, 20, bytes.len() / 2] {
-        std::fs::write(&path, &bytes[..cut]).expect("a shorter file");
-        let run = RunOptions { checkpoint: Some(path.clone()), ..RunOptions::default() };
-        assert!(matches!(train(&mut Nerf::new(small_nerf()), &data, &json, &run, &Silent), Err(Error::Input(_))));
-    }
+#[test]
+fn a_run_that_loses_control_is_told_and_gives_no_result() {
+    let data = RayDataset::from_images(photographs(3, ball(0.06)), 0).expect("3 good views");
+    let mut nerf = Nerf::new(NerfOptions { learning_rate: f32::NAN, ..small_nerf() }, &data);
+    let error = run(&mut nerf, &data, &serde_json::Value::Null, &RunOptions::default(), &Silent);
+    let error = error.expect_err("it diverges").to_string();
+    assert!(error.contains("diverged"), "{error}");
 }
 
 #[test]
@@ -233,18 +323,44 @@ fn a_sequence_on_disk_becomes_a_mesh_and_pictures() {
     options.method = Method::Neus(small_neus().with_iterations(60));
     options.data.max_side_px = 64;
     options.surface.voxel_mm = 4.0;
-    let (mesh, summary) = reconstruct(&sequence, &options, &Silent).expect("a mesh");
+    options.cameras = CameraOptions { refine_poses: true, start: 10, ..CameraOptions::default() };
+    let cameras = dir.path().join("cameras");
+    let (mesh, summary) = reconstruct(&sequence, &options, Some(&cameras), &Silent).expect("a mesh");
     assert_eq!((summary.images, summary.training.steps), (9, 60));
     let bounds = mesh.bounds();
     assert!((bounds.center().coords - CENTER).norm() < 0.03, "the mesh is not in the world frame: {bounds:?}");
     assert_eq!(mesh.vertex_colors.map(|c| c.len()), Some(mesh.vertices.len()));
 
     options.method = Method::Nerf(small_nerf());
+    assert!(summary.training.cameras.expect("cameras are corrected").center_mm > 0.0);
+    assert_eq!(mb_capture::PoseFolder::open(&cameras).expect("poses").frames().len(), 9);
     let out = dir.path().join("views");
-    let summary = synthesize(&sequence, &options, &out, &Silent).expect("pictures");
+    let mut views =
+        Views { path: CameraPath::HeldOut, out: out.clone(), film: None, frames_per_second: 30.0 };
+    options.run.previews = Some(dir.path().join("previews"));
+    options.run.checkpoint = Some(dir.path().join("trained"));
+    let summary = synthesize(&sequence, &options, &views, &Silent).expect("pictures");
+    assert_eq!(
+        mb_image::read_size(dir.path().join("previews/step_0000012.png")).expect("a preview"),
+        ImageSize::new(128, 64)
+    );
     assert_eq!(summary.per_image.iter().map(|v| v.frame.0).collect::<Vec<_>>(), [0, 8]);
     for name in ["000000.png", "000008.png", "reference/000000.png", "reference/000008.png"] {
         assert_eq!(mb_image::read_size(out.join(name)).expect("a picture"), ImageSize::new(64, 64));
+    }
+    // The trained field shows other views without training again.
+    for (path, n) in [(CameraPath::Orbit(3), 3), (CameraPath::Folder(cameras), 9)] {
+        (views.path, views.out) = (path, dir.path().join(format!("new{n}")));
+        let summary = synthesize(&sequence, &options, &views, &Silent).expect("pictures");
+        assert_eq!((summary.training.first_step, summary.images, summary.psnr_db), (12, n, None));
+        assert!(views.out.join(format!("{:06}.png", n - 1)).exists());
+    }
+    for method in FieldOptions::METHODS {
+        for preset in FieldOptions::PRESETS {
+            let options = FieldOptions::preset(method, preset, 0).expect("every method has both presets");
+            let json = serde_json::to_string(&options).expect("plain data");
+            assert_eq!(serde_json::from_str::<FieldOptions>(&json).expect("what was written"), options);
+        }
     }
     assert!(FieldOptions::preset("nerf", "slow", 0).is_none());
 }

@@ -1,10 +1,11 @@
 //! `reconstruct`: a sequence's surface, by one of the methods.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
-use mb_job::{Error, Result};
+use mb_job::{Error, InputError, Result};
 use mb_neural::FieldOptions;
+use mb_neural::results::write_beside;
 use mb_recon::{PoseSource, TsdfOptions, reconstruct_tsdf};
 
 use super::{Seed, SequenceArgument};
@@ -18,6 +19,8 @@ pub enum Reconstruct {
     Tsdf(Tsdf),
     /// A density field on a hash grid, trained on the photographs (Mildenhall et al. 2020; Mueller et al. 2022)
     Nerf(Field),
+    /// A density field on voxels, trained on the photographs (Sun et al. 2022)
+    Dvgo(Field),
     /// A signed distance field on a hash grid, trained on the photographs (Wang et al. 2021)
     Neus(Field),
 }
@@ -28,6 +31,7 @@ impl Reconstruct {
         match self {
             Self::Tsdf(c) => c.run(terminal),
             Self::Nerf(c) => c.run("nerf", terminal),
+            Self::Dvgo(c) => c.run("dvgo", terminal),
             Self::Neus(c) => c.run("neus", terminal),
         }
     }
@@ -107,6 +111,14 @@ impl Tsdf {
 /// What all trained fields share.
 #[derive(Debug, Args)]
 pub struct FieldTraining {
+    /// `fast` is made for a processor; `paper` has the published sizes and steps, which take days there
+    #[arg(long, value_name = "PRESET", default_value = "fast", value_parser = FieldOptions::PRESETS, conflicts_with = "options")]
+    preset: String,
+
+    /// Start from the options of this JSON file instead: those that lie beside every result, under "options"
+    #[arg(long, value_name = "FILE")]
+    options: Option<PathBuf>,
+
     /// Steps of training; schedules follow. The default is the preset's
     #[arg(long, value_name = "N")]
     iterations: Option<u64>,
@@ -115,27 +127,91 @@ pub struct FieldTraining {
     #[arg(long, value_name = "PX")]
     max_side: Option<usize>,
 
-    /// File to keep the state of training in; a run that finds one goes on from it
+    /// Do not use masks, also where every frame has one
+    #[arg(long)]
+    no_masks: bool,
+
+    /// Correct the pose of each photograph while training
+    #[arg(long)]
+    refine_poses: bool,
+
+    /// Correct the focal length of each photograph while training
+    #[arg(long)]
+    refine_focal: bool,
+
+    /// File to keep the state of training in, also after the end; a run that finds one goes on from it. Without it the
+    /// state is kept beside the output until the run has ended
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
+
+    /// Folder for pictures of one view as training goes on, beside its photograph
+    #[arg(long, value_name = "DIR")]
+    previews: Option<PathBuf>,
+
+    /// Largest memory for photographs, parameters and work, MiB; a run that needs more is refused at its start
+    #[arg(long, value_name = "MIB")]
+    memory: Option<usize>,
 
     #[command(flatten)]
     seed: Seed,
 }
 
 impl FieldTraining {
-    /// The options of `method` (`nerf`, `neus`).
-    pub fn options(&self, method: &str) -> Result<FieldOptions> {
-        let mut options = FieldOptions::preset(method, "fast", self.seed.seed)
-            .ok_or_else(|| Error::Failed(format!("there is no method {method} with a preset `fast`")))?;
+    /// The options of `method` (`nerf`, `dvgo`, `neus`) for a result of this name.
+    pub fn options(&self, method: &str, out: &Path) -> Result<FieldOptions> {
+        let mut options = match &self.options {
+            Some(file) => read_options(file, method)?,
+            None => FieldOptions::preset(method, &self.preset, self.seed.seed)
+                .ok_or_else(|| Error::Failed(format!("{method} has no preset `{}`", self.preset)))?,
+        };
         if let Some(iterations) = self.iterations {
             options = options.with_iterations(iterations);
         }
         if let Some(max_side_px) = self.max_side {
             options.data.max_side_px = max_side_px;
         }
-        options.run.checkpoint.clone_from(&self.checkpoint);
+        options.data.masks &= !self.no_masks;
+        options.cameras.refine_poses |= self.refine_poses;
+        options.cameras.refine_focal |= self.refine_focal;
+        options.run.checkpoint = Some(self.checkpoint.clone().unwrap_or_else(|| own_checkpoint(out)));
+        options.run.previews.clone_from(&self.previews);
+        if let Some(memory) = self.memory {
+            options.run.memory_mib = memory;
+        }
         Ok(options)
+    }
+
+    /// Removes the state of training after the end, unless the person named a file for it.
+    pub fn finish(&self, out: &Path) {
+        if self.checkpoint.is_none() {
+            std::fs::remove_file(own_checkpoint(out)).ok();
+        }
+    }
+}
+
+/// The state of training of a result, until it is there.
+fn own_checkpoint(out: &Path) -> PathBuf {
+    beside(out, ".checkpoint")
+}
+
+/// `DIR/castle` and `.json` for `DIR/castle.ply`.
+fn beside(out: &Path, ending: &str) -> PathBuf {
+    let mut name = out.with_extension("").into_os_string();
+    name.push(ending);
+    name.into()
+}
+
+fn read_options(file: &Path, method: &str) -> Result<FieldOptions> {
+    let text = std::fs::read_to_string(file).map_err(|e| InputError::unreadable(file, &e))?;
+    let wrong = |found: String| {
+        InputError::new(file, found).help("Take the file that lies beside a result of the same method")
+    };
+    let json: serde_json::Value = serde_json::from_str(&text).map_err(|e| wrong(format!("not JSON ({e})")))?;
+    let inner = json.get("options").cloned().unwrap_or(json);
+    let options: FieldOptions = serde_json::from_value(inner).map_err(|e| wrong(format!("not the options of a field ({e})")))?;
+    match options.method.name() == method {
+        true => Ok(options),
+        false => Err(wrong(format!("the options of {}, not of {method}", options.method.name())).into()),
     }
 }
 
@@ -145,9 +221,18 @@ pub struct Field {
     #[command(flatten)]
     sequence: SequenceArgument,
 
-    /// Mesh to write: .ply, .obj, .glb or .stl; metres, the sequence's world frame
+    /// Mesh to write: .ply, .obj, .glb or .stl; metres, the sequence's world frame. Beside it: options and figures
+    /// (.json), the loss curve (.curve.csv), corrected cameras (.cameras/)
     #[arg(short, long, value_name = "MESH")]
     out: PathBuf,
+
+    /// Spacing of the grid that the surface is taken from, millimetres
+    #[arg(long, value_name = "MM")]
+    voxel: Option<f64>,
+
+    /// Keep also what no camera sees
+    #[arg(long)]
+    no_cull: bool,
 
     #[command(flatten)]
     training: FieldTraining,
@@ -155,14 +240,23 @@ pub struct Field {
 
 impl Field {
     fn run(&self, method: &str, terminal: &Terminal) -> Result<Outcome> {
-        let options = self.training.options(method)?;
-        let (mesh, summary) = mb_neural::reconstruct(&self.sequence.open()?, &options, terminal)?;
+        let mut options = self.training.options(method, &self.out)?;
+        if let Some(voxel_mm) = self.voxel {
+            options.surface.voxel_mm = voxel_mm;
+        }
+        options.surface.cull &= !self.no_cull;
+        let cameras = beside(&self.out, ".cameras");
+        let (mesh, summary) = mb_neural::reconstruct(&self.sequence.open()?, &options, Some(&cameras), terminal)?;
         mb_mesh::write_mesh(&self.out, &mesh)?;
+        write_beside(&beside(&self.out, ""), &summary, &summary.training.curve)?;
+        self.training.finish(&self.out);
         let text = format!(
-            "wrote {}: {} triangles from {} photographs",
+            "wrote {}: {} triangles from {} photographs after {} steps ({:.1} dB)",
             self.out.display(),
             summary.triangles,
-            summary.images
+            summary.images,
+            summary.training.steps,
+            summary.training.curve.last().map_or(f64::NAN, |p| p.psnr_db),
         );
         Outcome::new(&summary, text)
     }

@@ -1,0 +1,638 @@
+//! The original NeuS (Wang et al. 2021; `neus --preset paper`): a signed distance in a deep network, sampled where it
+//! crosses zero.
+//!
+//! A ray has `samples` even samples over the two radii around its point nearest to the centre. Four rounds add a quarter
+//! of `importance` each, drawn from the weights that the distances would have under a logistic density of sharpness 64,
+//! 128, 256, 512. Opacities are taken at the middle of each section ([`crate::neus_alpha`]). Without masks, sections
+//! outside the unit ball and `outside` further samples, even in inverse distance, belong to a NeRF++ background, whose
+//! network sees a unit direction and an inverse distance.
+//!
+//! The loss is `sum_rgb |C - C*| + eikonal * mean (|n| - 1)^2 + mask * BCE(sum w, mask)`, the second over sections within
+//! 1.2 radii. Nothing is sent back through the places of the samples.
+
+use mb_job::{Rng, rng};
+use rand::RngExt;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::adam::{AdamOptions, Parameters, Schedule};
+use crate::cameras::{CameraResiduals, RayGradient};
+use crate::composite::{Composite, CompositeGradient, composite, composite_backward, opacity};
+use crate::dataset::{RayDataset, SceneRay, TargetRay};
+use crate::frequency_field::{
+    DensityActivation, FrequencyField, FrequencyFieldOptions, FrequencyParameters, FrequencyTransposed,
+    FrequencyWorker,
+};
+use crate::model::{GROUPS, Level, Model, StepReport, same_lengths};
+use crate::neus::{eikonal, section};
+use crate::sampling::importance;
+use crate::sdf_field::{SdfField, SdfFieldOptions, SdfWorker};
+use crate::simd::sigmoid;
+
+/// How an original NeuS is trained. "NeuS" names the paper and the authors' `confs/wmask.conf`, `confs/womask.conf`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NeusOriginalOptions {
+    /// Steps (NeuS: 300,000).
+    pub iterations: u64,
+    /// Rays of a step (NeuS: 512).
+    pub rays: usize,
+    /// Even samples (NeuS: 64).
+    pub samples: usize,
+    /// Further samples, over all rounds (NeuS: 64).
+    pub importance: usize,
+    /// Rounds (NeuS: 4).
+    pub rounds: usize,
+    /// Samples of the background, where there are no masks (NeuS: 32).
+    pub outside: usize,
+    /// The surface.
+    pub field: SdfFieldOptions,
+    /// The background.
+    pub background: FrequencyFieldOptions,
+    /// Learning rate (NeuS: 5e-4).
+    pub learning_rate: f32,
+    /// Its course (NeuS: 5,000 steps of warm-up, then a cosine to 0.05).
+    pub schedule: Schedule,
+    /// The sharpness starts at exp(10 v) with this v (NeuS: 0.3).
+    pub initial_sharpness: f32,
+    /// Steps until rays must face the surface (NeuS: 50,000 without masks, 0 with).
+    pub anneal: u64,
+    /// Weight of the eikonal loss (NeuS: 0.1).
+    pub eikonal: f32,
+    /// Weight of the mask loss (NeuS: 0.1 with masks).
+    pub mask: f32,
+    /// Learn only what the masks show, where there are masks.
+    pub use_masks: bool,
+    /// Random numbers.
+    pub seed: u64,
+}
+
+impl NeusOriginalOptions {
+    /// The paper's numbers.
+    pub fn paper() -> Self {
+        Self {
+            iterations: 300_000,
+            rays: 512,
+            samples: 64,
+            importance: 64,
+            rounds: 4,
+            outside: 32,
+            field: SdfFieldOptions::paper(),
+            background: FrequencyFieldOptions { activation: DensityActivation::Softplus, ..FrequencyFieldOptions::PAPER },
+            learning_rate: 5e-4,
+            schedule: Schedule::WarmCosine { warm_up: 5_000, end: 300_000, floor: 0.05 },
+            initial_sharpness: 0.3,
+            anneal: 50_000,
+            eikonal: 0.1,
+            mask: 0.1,
+            use_masks: true,
+            seed: 0,
+        }
+    }
+
+    /// The same with another number of steps: warm-up, schedule and annealing follow.
+    #[must_use]
+    pub fn with_iterations(mut self, iterations: u64) -> Self {
+        let scale = |n: u64| (n as f64 * iterations as f64 / self.iterations.max(1) as f64).round() as u64;
+        if let Schedule::WarmCosine { warm_up, floor, .. } = self.schedule {
+            self.schedule = Schedule::WarmCosine { warm_up: scale(warm_up), end: iterations, floor };
+        }
+        self.anneal = scale(self.anneal);
+        self.iterations = iterations;
+        self
+    }
+}
+
+/// Where a section of a ray takes its opacity and colour from.
+#[derive(Debug, Clone, Copy)]
+enum Slot {
+    Inner(usize),
+    Outer(usize),
+}
+
+/// Sections of a tile: those that the surface is asked for, those of the background, and which of them each ray shows.
+#[derive(Debug, Default)]
+struct Tile {
+    inner: Vec<[f32; 3]>,
+    inner_t: Vec<f32>,
+    inner_dt: Vec<f32>,
+    inner_runs: Vec<(u32, [f32; 3])>,
+    outer: Vec<[f32; 4]>,
+    outer_t: Vec<f32>,
+    outer_dt: Vec<f32>,
+    outer_runs: Vec<(u32, [f32; 3])>,
+    slots: Vec<Slot>,
+    /// Slots of each ray.
+    counts: Vec<usize>,
+    alphas: Vec<f32>,
+    rgb: Vec<[f32; 3]>,
+    weights: Vec<f32>,
+    composites: Vec<Composite>,
+    d_alphas: Vec<f32>,
+    d_rgb: Vec<[f32; 3]>,
+}
+
+#[derive(Debug, Default)]
+struct Group {
+    sdf: SdfWorker,
+    /// For the rounds of sampling, which send nothing back.
+    probe: SdfWorker,
+    outside: FrequencyWorker<4>,
+    tile: Tile,
+    rays: Vec<TargetRay>,
+    gradients: Vec<RayGradient>,
+    d_cosines: Vec<f32>,
+    loss: f64,
+    squared: f64,
+    samples: usize,
+    d_sharpness: f32,
+}
+
+/// An original NeuS in training.
+pub struct NeusOriginal {
+    options: NeusOriginalOptions,
+    field: SdfField,
+    outside: FrequencyField<4>,
+    outside_parameters: FrequencyParameters,
+    /// v, with sharpness s = exp(10 v).
+    sharpness: Parameters,
+    groups: Vec<Group>,
+    with_masks: bool,
+}
+
+/// Rays that go through the networks at once.
+const TILE_RAYS: usize = 4;
+/// Reach of the eikonal loss around the centre, in radii (the authors' code).
+const RELAXED: f32 = 1.2;
+/// PyTorch's constants.
+const ADAM: AdamOptions = AdamOptions { beta1: 0.9, beta2: 0.999, epsilon: 1e-8, skip_untouched: false };
+
+impl NeusOriginal {
+    /// A NeuS at its start.
+    pub fn new(options: NeusOriginalOptions, data: &RayDataset) -> Self {
+        let mut rng = rng(options.seed, u64::MAX);
+        let field = SdfField::new(options.field.clone(), &mut rng);
+        let outside = FrequencyField::new(&options.background);
+        Self {
+            outside_parameters: outside.init(&mut rng),
+            sharpness: Parameters::new(vec![options.initial_sharpness]),
+            groups: (0..GROUPS).map(|_| Group::default()).collect(),
+            with_masks: options.use_masks && data.has_masks(),
+            field,
+            outside,
+            options,
+        }
+    }
+
+    fn sharpness(&self) -> f32 {
+        (10.0 * self.sharpness.values[0]).exp().clamp(1e-6, 1e6)
+    }
+
+    fn anneal(&self, step: u64) -> f32 {
+        // The authors anneal only without masks.
+        let over = if self.with_masks { 0 } else { self.options.anneal };
+        if over == 0 { 1.0 } else { (step as f32 / over as f32).min(1.0) }
+    }
+
+    /// Ascending starts of a ray's sections: even ones, then the rounds.
+    fn depths(&self, ray: &SceneRay, mut rng: Option<&mut Rng>, probe: &mut SdfWorker) -> Vec<f32> {
+        let o = &self.options;
+        let middle = -(0..3).map(|d| ray.origin[d] * ray.direction[d]).sum::<f32>();
+        let shift = rng.as_mut().map_or(0.0, |rng| (rng.random::<f32>() - 0.5) * 2.0 / o.samples as f32);
+        let even = |i: usize| middle - 1.0 + 2.0 * i as f32 / (o.samples - 1).max(1) as f32 + shift;
+        let mut depths: Vec<f32> = (0..o.samples).map(even).collect();
+        let mut sdf = self.probed(ray, &depths, probe);
+        for round in 0..o.rounds {
+            let weights = round_weights(ray, &depths, &sdf, 64.0 * (1u32 << round) as f32);
+            let mut more = Vec::new();
+            importance(&depths, &weights, o.importance / o.rounds, None, &mut more);
+            let found = if round + 1 < o.rounds { self.probed(ray, &more, probe) } else { vec![0.0; more.len()] };
+            let mut both: Vec<(f32, f32)> =
+                depths.iter().copied().zip(sdf).chain(more.into_iter().zip(found)).collect();
+            both.sort_by(|a, b| a.0.total_cmp(&b.0));
+            (depths, sdf) = both.into_iter().unzip();
+        }
+        depths
+    }
+
+    fn probed(&self, ray: &SceneRay, depths: &[f32], probe: &mut SdfWorker) -> Vec<f32> {
+        let positions: Vec<[f32; 3]> = depths.iter().map(|t| ray.at(*t)).collect();
+        self.field.distance(&positions, probe);
+        probe.sdf.clone()
+    }
+
+    /// Adds a ray's sections to the tile.
+    fn place(&self, ray: &SceneRay, mut rng: Option<&mut Rng>, probe: &mut SdfWorker, tile: &mut Tile) {
+        let o = &self.options;
+        let mut starts = self.depths(ray, rng.as_deref_mut(), probe);
+        let last = 2.0 / o.samples as f32;
+        let inner_sections = starts.len();
+        if !self.with_masks {
+            let middle = -(0..3).map(|d| ray.origin[d] * ray.direction[d]).sum::<f32>();
+            let n = o.outside;
+            let even = |i: f32| 1e-3 + (1.0 - 1.0 / (n as f32 + 1.0) - 1e-3) * i / (n - 1).max(1) as f32;
+            // Ascending in distance, each shifted inside the half-way marks to its neighbours.
+            for i in (0..n).rev() {
+                let (low, high) = (even((i as f32 - 0.5).max(0.0)), even((i as f32 + 0.5).min((n - 1) as f32)));
+                let u = match rng.as_mut() {
+                    Some(rng) => low + (high - low) * rng.random::<f32>(),
+                    None => even(i as f32),
+                };
+                starts.push((middle + 1.0) / u + 1.0 / o.samples as f32);
+            }
+        }
+        let (mut inner, mut outer) = (0, 0);
+        for (i, start) in starts.iter().enumerate() {
+            let dt = starts.get(i + 1).map_or(last, |next| next - start);
+            let t = start + 0.5 * dt;
+            let p = ray.at(t);
+            let norm = p.iter().map(|c| c * c).sum::<f32>().sqrt();
+            let shows_surface = i < inner_sections && (self.with_masks || norm < 1.0);
+            if i < inner_sections && (self.with_masks || norm < RELAXED) {
+                tile.inner.push(p);
+                tile.inner_t.push(t);
+                tile.inner_dt.push(dt);
+                inner += 1;
+            }
+            if shows_surface {
+                tile.slots.push(Slot::Inner(tile.inner.len() - 1));
+            } else {
+                let norm = norm.max(1.0);
+                tile.slots.push(Slot::Outer(tile.outer.len()));
+                tile.outer.push([p[0] / norm, p[1] / norm, p[2] / norm, 1.0 / norm]);
+                tile.outer_t.push(t);
+                tile.outer_dt.push(dt);
+                outer += 1;
+            }
+        }
+        tile.inner_runs.push((inner, ray.direction));
+        tile.outer_runs.push((outer, ray.direction));
+        tile.counts.push(starts.len());
+    }
+
+    /// Samples and renders some rays into the group's tile.
+    fn shade(&self, rays: &[SceneRay], mut rng: Option<&mut Rng>, anneal: f32, group: &mut Group) {
+        let Group { sdf, probe, outside, tile, .. } = group;
+        for list in [&mut tile.inner_t, &mut tile.inner_dt, &mut tile.outer_t, &mut tile.outer_dt, &mut tile.alphas] {
+            list.clear();
+        }
+        tile.inner.clear();
+        tile.outer.clear();
+        tile.inner_runs.clear();
+        tile.outer_runs.clear();
+        tile.slots.clear();
+        tile.counts.clear();
+        tile.rgb.clear();
+        tile.composites.clear();
+        for ray in rays {
+            self.place(ray, rng.as_deref_mut(), probe, tile);
+        }
+        let s = self.sharpness();
+        self.field.distance(&tile.inner, sdf);
+        self.field.normals(sdf);
+        self.field.color(&tile.inner_runs, sdf);
+        self.outside.density(&self.outside_parameters, &tile.outer, outside);
+        self.outside.color(&self.outside_parameters, &tile.outer_runs, outside);
+        let (mut at, mut ray) = (0, 0);
+        for count in &tile.counts {
+            let direction = rays[ray].direction;
+            ray += 1;
+            for slot in &tile.slots[at..at + count] {
+                let (alpha, rgb) = match *slot {
+                    Slot::Inner(i) => (section(sdf, i, tile.inner_dt[i], direction).alpha(s, anneal), sdf.rgb[i]),
+                    Slot::Outer(i) => (opacity(outside.sigma[i], tile.outer_dt[i]), outside.rgb[i]),
+                };
+                tile.alphas.push(alpha);
+                tile.rgb.push(rgb);
+            }
+            at += count;
+        }
+        tile.weights.resize(tile.alphas.len(), 0.0);
+        at = 0;
+        for count in &tile.counts {
+            let run = at..at + count;
+            at = run.end;
+            let found = composite(&tile.alphas[run.clone()], &tile.rgb[run.clone()], [0.0; 3], &mut tile.weights[run]);
+            tile.composites.push(found);
+        }
+    }
+
+    fn run_group(
+        &self,
+        data: &RayDataset,
+        cameras: &CameraResiduals,
+        step: u64,
+        transposed: &FrequencyTransposed,
+        rng: &mut Rng,
+        group: &mut Group,
+    ) {
+        let rays = self.options.rays.div_ceil(GROUPS);
+        let anneal = self.anneal(step);
+        data.draw(rng, rays, cameras, &mut group.rays);
+        (group.loss, group.squared, group.samples, group.d_sharpness) = (0.0, 0.0, 0, 0.0);
+        group.gradients.clear();
+        for first in (0..rays).step_by(TILE_RAYS) {
+            let range = first..(first + TILE_RAYS).min(rays);
+            let tile: Vec<SceneRay> = group.rays[range.clone()].iter().map(|t| t.ray).collect();
+            self.shade(&tile, Some(rng), anneal, group);
+            group.samples += group.tile.slots.len();
+            self.losses(group, range.clone(), 1.0 / (rays * GROUPS) as f32);
+            self.send_back(group, &tile, anneal, 1.0 / (rays * GROUPS) as f32);
+            self.outside.backward(&self.outside_parameters, transposed, &mut group.outside);
+            self.field.backward(&mut group.sdf);
+            if cameras.wants_gradients(step) {
+                self.ray_gradients(group, range);
+            }
+        }
+    }
+
+    /// The loss of each ray, and its derivatives with respect to opacities and colours.
+    fn losses(&self, group: &mut Group, range: std::ops::Range<usize>, scale: f32) {
+        let tile = &mut group.tile;
+        tile.d_alphas.clear();
+        tile.d_alphas.resize(tile.alphas.len(), 0.0);
+        tile.d_rgb.clear();
+        tile.d_rgb.resize(tile.alphas.len(), [0.0; 3]);
+        let mut start = 0;
+        for (i, target) in group.rays[range].iter().enumerate() {
+            let run = start..start + tile.counts[i];
+            start = run.end;
+            let found = &tile.composites[i];
+            let mask = target.mask.filter(|_| self.with_masks);
+            // With masks only rays through the object count for the colour, as the authors weigh them.
+            let share = mask.unwrap_or(1.0);
+            let error: [f32; 3] = std::array::from_fn(|c| (found.rgb[c] - target.rgb[c]) * share);
+            group.squared += error.iter().map(|e| f64::from(e * e)).sum::<f64>();
+            group.loss += error.iter().map(|e| f64::from(e.abs())).sum::<f64>();
+            let mut gradient =
+                CompositeGradient { d_rgb: error.map(|e| if e == 0.0 { 0.0 } else { e.signum() * scale * share }), d_transmittance: 0.0 };
+            if let Some(mask) = mask {
+                let cover = (1.0 - found.transmittance).clamp(1e-3, 1.0 - 1e-3);
+                group.loss -= f64::from(self.options.mask * (mask * cover.ln() + (1.0 - mask) * (1.0 - cover).ln()));
+                gradient.d_transmittance = self.options.mask * scale * (mask / cover - (1.0 - mask) / (1.0 - cover));
+            }
+            composite_backward(
+                &tile.alphas[run.clone()],
+                &tile.rgb[run.clone()],
+                [0.0; 3],
+                &tile.weights[run.clone()],
+                found,
+                &gradient,
+                &mut tile.d_alphas[run.clone()],
+                &mut tile.d_rgb[run],
+            );
+        }
+    }
+
+    /// From opacities and colours back to distance, normal, sharpness and density; adds the eikonal loss.
+    fn send_back(&self, group: &mut Group, rays: &[SceneRay], anneal: f32, scale: f32) {
+        let s = self.sharpness();
+        let Group { sdf, outside, tile, d_cosines, .. } = group;
+        let inner = tile.inner.len();
+        let near = |p: &[f32; 3]| p.iter().map(|c| c * c).sum::<f32>().sqrt() < RELAXED;
+        let relaxed = tile.inner.iter().filter(|p| near(p)).count();
+        // The mean over the sections of these rays stands for the mean over all.
+        let weight = self.options.eikonal * scale * rays.len() as f32 / (relaxed as f32 + 1e-5);
+        sdf.d_sdf.clear();
+        sdf.d_sdf.resize(inner, 0.0);
+        sdf.d_rgb.clear();
+        sdf.d_rgb.resize(inner, [0.0; 3]);
+        sdf.d_normals.clear();
+        d_cosines.clear();
+        d_cosines.resize(inner, 0.0);
+        for (p, n) in tile.inner.iter().zip(&sdf.normals) {
+            let (loss, pull) = if near(p) { eikonal(*n, weight) } else { (0.0, [0.0; 3]) };
+            group.loss += f64::from(loss / scale);
+            sdf.d_normals.push(pull);
+        }
+        outside.d_sigma.clear();
+        outside.d_sigma.resize(tile.outer.len(), 0.0);
+        outside.d_rgb.clear();
+        outside.d_rgb.resize(tile.outer.len(), [0.0; 3]);
+        let mut at = 0;
+        for (ray, count) in rays.iter().zip(&tile.counts) {
+            for slot in at..at + count {
+                let d_alpha = tile.d_alphas[slot];
+                match tile.slots[slot] {
+                    Slot::Inner(i) => {
+                        let derivative = section(sdf, i, tile.inner_dt[i], ray.direction).gradient(s, anneal);
+                        sdf.d_sdf[i] = d_alpha * derivative.sdf;
+                        sdf.d_rgb[i] = tile.d_rgb[slot];
+                        group.d_sharpness += d_alpha * derivative.sharpness;
+                        d_cosines[i] = d_alpha * derivative.cosine;
+                        for d in 0..3 {
+                            sdf.d_normals[i][d] += d_cosines[i] * ray.direction[d];
+                        }
+                    }
+                    Slot::Outer(i) => {
+                        outside.d_sigma[i] = d_alpha * tile.outer_dt[i] * (1.0 - tile.alphas[slot]);
+                        outside.d_rgb[i] = tile.d_rgb[slot];
+                    }
+                }
+            }
+            at += count;
+        }
+    }
+
+    fn ray_gradients(&self, group: &mut Group, range: std::ops::Range<usize>) {
+        let Group { sdf, outside, tile, rays, gradients, d_cosines, .. } = group;
+        self.field.ray_gradients(&tile.inner_runs, sdf);
+        self.outside.ray_gradients(&tile.outer_runs, outside);
+        let (mut inner, mut outer) = (0, 0);
+        for (ray, target) in rays[range].iter().enumerate() {
+            let mut gradient = RayGradient {
+                origin: [0.0; 3],
+                direction: std::array::from_fn(|d| sdf.d_directions[ray][d] + outside.d_directions[ray][d]),
+            };
+            for i in inner..inner + tile.inner_runs[ray].0 as usize {
+                gradient.add_point(tile.inner_t[i], sdf.d_positions[i]);
+                for d in 0..3 {
+                    gradient.direction[d] += d_cosines[i] * sdf.normals[i][d];
+                }
+            }
+            inner += tile.inner_runs[ray].0 as usize;
+            for i in outer..outer + tile.outer_runs[ray].0 as usize {
+                let t = tile.outer_t[i];
+                gradient.add_point(t, inverted_gradient(target.ray.at(t), outside.d_positions[i]));
+            }
+            outer += tile.outer_runs[ray].0 as usize;
+            gradients.push(gradient);
+        }
+    }
+}
+
+/// Weights of the sections between neighbouring samples under a logistic density of this sharpness, from the samples'
+/// distances alone (the authors' `up_sample`): the slope of a section is the steeper of its own and the one before, never
+/// upwards, and zero outside the ball.
+fn round_weights(ray: &SceneRay, depths: &[f32], sdf: &[f32], sharpness: f32) -> Vec<f32> {
+    let inside = |t: f32| ray.at(t).iter().map(|c| c * c).sum::<f32>() < 1.0;
+    let (mut light, mut before) = (1.0, 0.0f32);
+    (0..depths.len() - 1)
+        .map(|i| {
+            let dt = depths[i + 1] - depths[i];
+            let slope = (sdf[i + 1] - sdf[i]) / (dt + 1e-5);
+            let steeper = slope.min(before).clamp(-1e3, 0.0);
+            before = slope;
+            let slope = if inside(depths[i]) || inside(depths[i + 1]) { steeper } else { 0.0 };
+            let middle = 0.5 * (sdf[i] + sdf[i + 1]);
+            let (p, q) = (
+                sigmoid(sharpness * (middle - 0.5 * slope * dt)),
+                sigmoid(sharpness * (middle + 0.5 * slope * dt)),
+            );
+            let alpha = (p - q + 1e-5) / (p + 1e-5);
+            let weight = light * alpha;
+            light *= 1.0 - alpha + 1e-7;
+            weight
+        })
+        .collect()
+}
+
+/// `J^T g` of `p -> (p / m, 1 / m)`, `m = max(|p|, 1)`.
+fn inverted_gradient(p: [f32; 3], g: [f32; 4]) -> [f32; 3] {
+    let m = p.iter().map(|c| c * c).sum::<f32>().sqrt();
+    if m <= 1.0 {
+        return [g[0], g[1], g[2]];
+    }
+    let along = (p[0] * g[0] + p[1] * g[1] + p[2] * g[2]) / (m * m);
+    std::array::from_fn(|d| (g[d] - along * p[d]) / m - g[3] * p[d] / (m * m * m))
+}
+
+impl Model for NeusOriginal {
+    fn name(&self) -> &'static str {
+        "neus"
+    }
+
+    fn iterations(&self) -> u64 {
+        self.options.iterations
+    }
+
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport {
+        let transposed = self.outside.transpose(&self.outside_parameters);
+        let mut groups = std::mem::take(&mut self.groups);
+        groups.par_iter_mut().enumerate().for_each(|(i, group)| {
+            let mut rng = rng(self.options.seed, step * GROUPS as u64 + i as u64);
+            self.run_group(data, cameras, step, &transposed, &mut rng, group);
+        });
+        self.field.collect(groups.iter_mut().map(|g| &mut g.sdf));
+        self.outside.collect(&mut self.outside_parameters, groups.iter_mut().map(|g| &mut g.outside));
+        // ds/dv = 10 s.
+        self.sharpness.grads[0] = groups.iter().map(|g| g.d_sharpness).sum::<f32>() * 10.0 * self.sharpness();
+        let factor = self.options.schedule.factor(step);
+        if cameras.wants_gradients(step) {
+            cameras.add(data, groups.iter().flat_map(|g| g.rays.iter().zip(&g.gradients)));
+            cameras.step(data, factor, step);
+        }
+        let lr = self.options.learning_rate * factor;
+        self.field.step(&ADAM, lr, lr, step + 1);
+        self.sharpness.step(&ADAM, lr, step + 1);
+        if !self.with_masks {
+            self.outside_parameters.step(&ADAM, lr, step + 1);
+        }
+        let rays = groups.iter().map(|g| g.rays.len()).sum::<usize>();
+        let report = StepReport {
+            loss: groups.iter().map(|g| g.loss).sum::<f64>() / rays as f64,
+            mse: groups.iter().map(|g| g.squared).sum::<f64>() / (3 * rays) as f64,
+            rays,
+            samples: groups.iter().map(|g| g.samples).sum(),
+        };
+        self.groups = groups;
+        report
+    }
+
+    fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
+        let parts: Vec<Vec<[f32; 3]>> = rays
+            .par_chunks(16)
+            .map(|rays| {
+                let mut group = Group::default();
+                let tiles = rays.chunks(TILE_RAYS).flat_map(|tile| {
+                    self.shade(tile, None, 1.0, &mut group);
+                    group.tile.composites.iter().map(|c| c.rgb).collect::<Vec<_>>()
+                });
+                tiles.collect()
+            })
+            .collect();
+        parts.concat()
+    }
+
+    fn level(&self) -> Level {
+        Level { value: 0.0, larger_inside: false }
+    }
+
+    fn surface(&self, positions: &[[f32; 3]]) -> Vec<f32> {
+        self.field.distances(positions)
+    }
+
+    fn may_cross(&self, _low: [f32; 3], _high: [f32; 3]) -> bool {
+        true
+    }
+
+    fn color_at(&self, positions: &[[f32; 3]], directions: &[[f32; 3]]) -> Vec<[f32; 3]> {
+        self.field.colors(positions, directions)
+    }
+
+    fn buffers(&mut self) -> Vec<&mut Vec<f32>> {
+        let mut all = self.field.buffers();
+        all.extend(self.outside_parameters.buffers());
+        all.extend([&mut self.sharpness.values, &mut self.sharpness.m, &mut self.sharpness.v]);
+        all
+    }
+
+    fn restored(&mut self, _step: u64) -> Result<(), String> {
+        let mut lengths = self.field.lengths();
+        lengths.extend(self.outside_parameters.lengths());
+        lengths.extend([1; 3]);
+        same_lengths(&self.buffers(), &lengths)?;
+        self.field.refresh();
+        Ok(())
+    }
+
+    fn is_finite(&self) -> bool {
+        self.field.is_finite() && self.outside_parameters.is_finite() && self.sharpness.is_finite()
+    }
+
+    fn parameter_count(&self) -> usize {
+        let outside = if self.with_masks { 0 } else { self.outside.parameter_count() };
+        self.field.parameter_count() + outside + 1
+    }
+
+    fn bytes(&self) -> usize {
+        let workers = 4 * GROUPS * self.field.parameter_count() + self.outside.worker_bytes(GROUPS);
+        16 * self.parameter_count() + workers
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rounds_gather_samples_at_the_surface() {
+        // A plane at distance 2 along the ray, met at right angles.
+        let ray = SceneRay { origin: [0.0, 0.0, -2.0], direction: [0.0, 0.0, 1.0] };
+        let depths: Vec<f32> = (0..65).map(|i| 1.0 + 2.0 * i as f32 / 64.0).collect();
+        let sdf: Vec<f32> = depths.iter().map(|t| 2.0 - t).collect();
+        let weights = round_weights(&ray, &depths, &sdf, 512.0);
+        let near: f32 = weights.iter().zip(&depths).filter(|(_, t)| (*t - 2.0).abs() < 0.05).map(|(w, _)| w).sum();
+        assert!(near > 0.95 * weights.iter().sum::<f32>());
+        // From behind, the surface stops nothing.
+        let back: Vec<f32> = sdf.iter().map(|f| -f).collect();
+        assert!(round_weights(&ray, &depths, &back, 512.0).iter().sum::<f32>() < 0.5);
+    }
+
+    #[test]
+    fn the_inverted_sphere_has_the_derivative_of_finite_differences() {
+        let g = [0.4, -0.7, 0.2, 0.9];
+        for p in [[0.2f32, 0.3, -0.1], [1.2, -0.8, 2.0]] {
+            for d in 0..3 {
+                let at = |h: f32| {
+                    let mut p = p;
+                    p[d] += h;
+                    let m = p.iter().map(|c| c * c).sum::<f32>().sqrt().max(1.0);
+                    (p[0] * g[0] + p[1] * g[1] + p[2] * g[2] + g[3]) / m
+                };
+                let expected = (at(1e-3) - at(-1e-3)) / 2e-3;
+                assert!((inverted_gradient(p, g)[d] - expected).abs() < 2e-3);
+            }
+        }
+    }
+}
