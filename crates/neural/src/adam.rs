@@ -77,11 +77,13 @@ impl Parameters {
         };
         let before = self.values.clone();
         self.step(options, lr, t);
-        self.values.par_chunks_mut(width).zip(before.par_chunks(width)).zip(scales).for_each(|((now, before), scale)| {
-            for (now, before) in now.iter_mut().zip(before) {
-                *now = before + scale * (*now - before);
-            }
-        });
+        self.values.par_chunks_mut(width).zip(before.par_chunks(width)).zip(scales).for_each(
+            |((now, before), scale)| {
+                for (now, before) in now.iter_mut().zip(before) {
+                    *now = before + scale * (*now - before);
+                }
+            },
+        );
     }
 
     /// Whether every parameter is a finite number.

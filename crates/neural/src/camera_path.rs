@@ -47,7 +47,9 @@ fn folder(root: &Path, data: &RayDataset, full_size: ImageSize) -> Result<Vec<Vi
             false => like.intrinsics,
         };
         if !world_from_cam.to_matrix().iter().all(|v| v.is_finite()) {
-            return Err(InputError::new(root, "the pose has a number that is not finite").at(format!("frame {frame}")).into());
+            return Err(InputError::new(root, "the pose has a number that is not finite")
+                .at(format!("frame {frame}"))
+                .into());
         }
         views.push(data.new_view(*frame, intrinsics, like.size(), *world_from_cam));
     }
@@ -61,7 +63,8 @@ fn orbit(data: &RayDataset, n: usize) -> Result<Vec<View>> {
         return Err(Error::Failed("an orbit of no views shows nothing; ask for at least one".to_owned()));
     }
     let middle = data.region().center;
-    let offsets: Vec<Vector3<f64>> = data.views().iter().map(|v| v.world_from_cam.translation() - middle.coords).collect();
+    let offsets: Vec<Vector3<f64>> =
+        data.views().iter().map(|v| v.world_from_cam.translation() - middle.coords).collect();
     let mean = offsets.iter().sum::<Vector3<f64>>() / offsets.len() as f64;
     let scatter: Matrix3<f64> = offsets.iter().map(|o| (o - mean) * (o - mean).transpose()).sum();
     let eigen = scatter.symmetric_eigen();

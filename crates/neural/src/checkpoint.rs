@@ -14,7 +14,8 @@ const MAGIC: &[u8; 16] = b"mb-neural ckpt 2";
 #[derive(Debug, Clone, Serialize, Deserialize, PartialEq)]
 pub(crate) struct Header {
     pub method: String,
-    pub options: serde_json::Value,
+    /// As text: numbers read back from JSON may differ in their last bit.
+    pub options: String,
     /// [`crate::dataset::RayDataset::fingerprint`].
     pub data: u64,
     pub step: u64,
@@ -23,7 +24,7 @@ pub(crate) struct Header {
 
 impl Header {
     pub fn new(method: &str, options: &serde_json::Value, data: u64) -> Self {
-        Self { method: method.to_owned(), options: options.clone(), data, step: 0, lengths: Vec::new() }
+        Self { method: method.to_owned(), options: options.to_string(), data, step: 0, lengths: Vec::new() }
     }
 }
 
@@ -55,10 +56,7 @@ pub(crate) fn read(path: &Path, expected: &Header, buffers: Vec<&mut Vec<f32>>) 
         usize::try_from(u64::from_le_bytes(*length)).ok().filter(|n| *n <= rest.len()).ok_or_else(truncated)?;
     let header: Header =
         serde_json::from_slice(&rest[..length]).map_err(|e| other(path, &format!("damaged header ({e})")))?;
-    if header.method != expected.method
-        || header.options != expected.options
-        || header.lengths.len() != buffers.len()
-    {
+    if header.method != expected.method || header.options != expected.options || header.lengths.len() != buffers.len() {
         return Err(other(path, "the checkpoint belongs to a run with other options").into());
     }
     if header.data != expected.data {

@@ -450,7 +450,6 @@ impl Dvgo {
                 &worker.rgb[run.clone()],
                 backgrounds[i],
                 &tile.weights[run.clone()],
-                found,
                 &gradient,
                 &mut worker.d_alphas[run.clone()],
                 &mut worker.d_rgb[run.clone()],
@@ -497,7 +496,8 @@ impl Dvgo {
             UnitBox { low: std::array::from_fn(|d| grow(d, -1.0)), high: std::array::from_fn(|d| grow(d, 1.0)) }
         } else {
             // Nothing was found; the trainer's own checks will tell. Keep all of the space open.
-            self.free = OccupancyGrid::new(cells);
+            self.free.values.fill(f32::INFINITY);
+            self.free.decide(self.options.free_space);
             UnitBox::ALL
         };
         let first = self.options.fine.voxels >> self.options.grow.len();
@@ -646,7 +646,8 @@ impl Model for Dvgo {
 
     fn buffers(&mut self) -> Vec<&mut Vec<f32>> {
         let mut all = self.parameters.buffers();
-        all.extend([&mut self.free.values, &mut self.layout]);
+        all.extend(self.free.buffers());
+        all.push(&mut self.layout);
         all
     }
 
@@ -664,12 +665,11 @@ impl Model for Dvgo {
             self.field = self.fine_field(size);
         }
         let mut lengths: Vec<usize> = self.field.lengths().iter().flat_map(|n| [*n; 3]).collect();
-        lengths.extend([FREE_CELLS.pow(3), 10]);
+        lengths.extend(self.free.lengths());
+        lengths.push(10);
         same_lengths(&self.buffers(), &lengths)?;
         self.parameters.restored();
-        if fine > 0.0 {
-            self.free.decide(self.options.free_space);
-        }
+        self.free.restored();
         Ok(())
     }
 

@@ -271,11 +271,7 @@ impl<const D: usize> FrequencyField<D> {
     }
 
     /// Adds everything that the workers gathered to the parameters' gradients, in the workers' order, and clears it.
-    pub fn collect<'a>(
-        &self,
-        p: &mut FrequencyParameters,
-        workers: impl Iterator<Item = &'a mut FrequencyWorker<D>>,
-    ) {
+    pub fn collect<'a>(&self, p: &mut FrequencyParameters, workers: impl Iterator<Item = &'a mut FrequencyWorker<D>>) {
         for worker in workers {
             add(&mut p.trunk.grads, &worker.trunk_grads);
             add(&mut p.head.grads, &worker.head_grads);

@@ -91,8 +91,7 @@ impl Cell {
     fn weight_second(&self, corner: usize, v: [f32; 3]) -> [f32; 3] {
         let pick = |d: usize| if corner >> d & 1 == 1 { self.t[d] } else { 1.0 - self.t[d] };
         let sign = |d: usize| if corner >> d & 1 == 1 { 1.0 } else { -1.0 };
-        let (xy, xz, yz) =
-            (sign(0) * sign(1) * pick(2), sign(0) * sign(2) * pick(1), sign(1) * sign(2) * pick(0));
+        let (xy, xz, yz) = (sign(0) * sign(1) * pick(2), sign(0) * sign(2) * pick(1), sign(1) * sign(2) * pick(0));
         [xy * v[1] + xz * v[2], xy * v[0] + yz * v[2], xz * v[0] + yz * v[1]]
     }
 

@@ -1,7 +1,7 @@
 //! Learned scene representations of one capture, trained on the processor with kernels of our own.
 //!
 //! In: a [`mb_capture::Sequence`]. Out: a mesh ([`reconstruct`]) or pictures of the held-out views ([`synthesize`]), in
-//! the sequence's metric world frame. [`FieldOptions`] says which method (`nerf`, `neus`) and how.
+//! the sequence's metric world frame. [`FieldOptions`] says which method (`nerf`, `dvgo`, `neus`) and how.
 //!
 //! ```no_run
 //! # fn main() -> mb_job::Result<()> {
@@ -18,9 +18,11 @@
 //! - kernels: [`simd`] (one matrix product, dispatched at run time), [`mlp`], [`hash_grid`], [`dense_grid`],
 //!   [`encoding`], [`composite`], [`neus_alpha`], [`sampling`], [`adam`]. Derivatives are derived by hand; each module
 //!   states its equations, and its tests hold them to finite differences.
-//! - fields: [`radiance_field`] (density and colour), [`sdf_field`] (distance, exact normals, colour).
-//! - methods: [`nerf`], [`neus`], behind [`model::Model`]; [`dataset`] gives them rays, [`trainer`] runs them,
-//!   [`extract`] takes the surface.
+//! - fields: [`radiance_field`] (density and colour on a hash grid), [`voxel_field`] (the same on voxels),
+//!   [`frequency_field`] (the same in one deep network), [`sdf_field`] (distance, exact normals, colour).
+//! - methods: [`nerf`], [`dvgo`], [`neus`] for a processor, [`nerf_original`] and [`neus_original`] as published, all behind
+//!   [`model::Model`]; [`dataset`] gives them rays, [`cameras`] corrects these, [`trainer`] runs them, [`extract`] takes
+//!   the surface, [`camera_path`] says what to render, [`results`] writes what lies beside a result.
 //!
 //! A step is cut into a fixed number of groups of rays. Each has its own random numbers, and their sums are added in
 //! order, so a run's result depends on the seed and the machine's instruction set, not on the number of threads.

@@ -123,7 +123,8 @@ impl FieldOptions {
     fn train(&self, data: &RayDataset, progress: &dyn Progress) -> Result<Trained> {
         let mut model = self.model(data);
         let mut cameras = CameraResiduals::new(&self.cameras, data);
-        let json = serde_json::to_value((&self.method, &self.cameras)).expect("options are plain data with string keys");
+        let json =
+            serde_json::to_value((&self.method, &self.cameras)).expect("options are plain data with string keys");
         let summary = train(model.as_mut(), data, &mut cameras, &json, &self.run, progress)?;
         Ok(Trained { model, cameras, summary })
     }

@@ -195,7 +195,9 @@ impl Nerf {
         let p = &self.parameters;
         self.field.density(p, &tile.positions, worker);
         if let Some(seen) = seen {
-            seen.extend(tile.positions.iter().map(|p| self.occupancy.cell(*p) as u32).zip(worker.sigma.iter().copied()));
+            seen.extend(
+                tile.positions.iter().map(|p| self.occupancy.cell(*p) as u32).zip(worker.sigma.iter().copied()),
+            );
         }
         tile.keep.clear();
         let mut first = 0;
@@ -319,7 +321,6 @@ impl Nerf {
                 &worker.rgb[run.clone()],
                 backgrounds[i],
                 &tile.weights[run.clone()],
-                &tile.composites[i],
                 &gradient,
                 d_weights,
                 &mut worker.d_rgb[run],
@@ -456,19 +457,17 @@ impl Model for Nerf {
 
     fn buffers(&mut self) -> Vec<&mut Vec<f32>> {
         let mut all = self.parameters.buffers();
-        all.push(&mut self.occupancy.values);
+        all.extend(self.occupancy.buffers());
         all.push(&mut self.samples_per_ray);
         all
     }
 
-    fn restored(&mut self, step: u64) -> Result<(), String> {
+    fn restored(&mut self, _step: u64) -> Result<(), String> {
         let mut lengths: Vec<usize> = self.parameters.lengths();
-        lengths.extend([self.options.occupancy.pow(3), 1]);
+        lengths.extend(self.occupancy.lengths());
+        lengths.push(1);
         same_lengths(&self.buffers(), &lengths)?;
-        let turn = step / self.options.occupancy_every;
-        if turn > 0 {
-            self.occupancy.decide(self.occupancy_threshold(turn));
-        }
+        self.occupancy.restored();
         Ok(())
     }
 
@@ -482,6 +481,8 @@ impl Model for Nerf {
 
     fn bytes(&self) -> usize {
         let o = &self.options;
-        16 * self.field.parameter_count() + 6 * o.occupancy.pow(3) + 2 * o.samples_per_step * self.field.bytes_per_sample()
+        16 * self.field.parameter_count()
+            + 6 * o.occupancy.pow(3)
+            + 2 * o.samples_per_step * self.field.bytes_per_sample()
     }
 }

@@ -249,7 +249,13 @@ impl NerfOriginal {
         for targets in rays.chunks(TILE_RAYS) {
             let tile: Vec<SceneRay> = targets.iter().map(|t| t.ray).collect();
             let backgrounds: Vec<[f32; 3]> = targets.iter().map(|_| std::array::from_fn(|_| rng.random())).collect();
-            self.render_rays(&tile, &backgrounds, Some(rng), (&mut *coarse_samples, coarse), (&mut *fine_samples, fine));
+            self.render_rays(
+                &tile,
+                &backgrounds,
+                Some(rng),
+                (&mut *coarse_samples, coarse),
+                (&mut *fine_samples, fine),
+            );
             let start = gradients.len();
             gradients.resize(start + targets.len(), RayGradient::default());
             for (pass, (samples, worker)) in
@@ -297,7 +303,6 @@ impl NerfOriginal {
                 &worker.rgb[run.clone()],
                 backgrounds[i],
                 &samples.weights[run.clone()],
-                &samples.composites[i],
                 &CompositeGradient { d_rgb: error.map(|e| 2.0 * scale * e), d_transmittance: 0.0 },
                 &mut worker.d_sigma[run.clone()],
                 &mut worker.d_rgb[run],

@@ -480,7 +480,6 @@ impl Neus {
                 &tile.rgb[run.clone()],
                 group.backgrounds[i],
                 &tile.weights[run.clone()],
-                found,
                 &gradient,
                 &mut tile.d_alphas[run.clone()],
                 &mut tile.d_rgb[run],
@@ -686,21 +685,24 @@ impl Model for Neus {
         let mut all = self.field.buffers();
         all.extend(self.outside_parameters.buffers());
         all.extend([&mut self.sharpness.values, &mut self.sharpness.m, &mut self.sharpness.v]);
-        all.extend([&mut self.inner_cells.values, &mut self.outer_cells.values, &mut self.samples_per_ray]);
+        all.extend(self.inner_cells.buffers());
+        all.extend(self.outer_cells.buffers());
+        all.push(&mut self.samples_per_ray);
         all
     }
 
     fn restored(&mut self, step: u64) -> Result<(), String> {
-        let cells = self.options.occupancy.pow(3);
         let mut lengths = self.field.lengths();
         lengths.extend(self.outside_parameters.lengths());
-        lengths.extend([1, 1, 1, cells, cells, 1]);
+        lengths.extend([1, 1, 1]);
+        lengths.extend(self.inner_cells.lengths());
+        lengths.extend(self.outer_cells.lengths());
+        lengths.push(1);
         same_lengths(&self.buffers(), &lengths)?;
         self.field.refresh();
         self.set_levels(step);
-        if step >= self.options.occupancy_every {
-            self.decide();
-        }
+        self.inner_cells.restored();
+        self.outer_cells.restored();
         Ok(())
     }
 

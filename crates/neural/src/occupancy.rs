@@ -13,6 +13,9 @@ pub struct OccupancyGrid {
     resolution: usize,
     /// Running maximum of the density; infinite before the first look.
     pub values: Vec<f32>,
+    /// What the last decision compared with (one number). [`Self::raise`] touches only cells above it, so values and
+    /// threshold give the same decision again.
+    pub threshold: Vec<f32>,
     occupied: Vec<bool>,
     /// Cells that no camera can say anything about: never occupied, never looked at.
     closed: Vec<bool>,
@@ -30,7 +33,13 @@ impl OccupancyGrid {
     /// `resolution`^3 cells, all occupied.
     pub fn new(resolution: usize) -> Self {
         let cells = resolution.pow(3);
-        Self { resolution, values: vec![f32::INFINITY; cells], occupied: vec![true; cells], closed: vec![false; cells] }
+        Self {
+            resolution,
+            values: vec![f32::INFINITY; cells],
+            threshold: vec![f32::NEG_INFINITY],
+            occupied: vec![true; cells],
+            closed: vec![false; cells],
+        }
     }
 
     /// Closes for good the cells that `keep` refuses, given centre and half edge in the unit cube: matter there would
@@ -66,7 +75,8 @@ impl OccupancyGrid {
         self.occupied[self.cell(p)]
     }
 
-    /// Raises cells to what a step's samples found there: between two looks at a cell, which each ask for one point,
+    /// Raises cells to what a step's samples found there (samples lie in occupied cells only): between two looks at a cell,
+    /// which each ask for one point,
     /// training itself has asked for hundreds, and a thin sheet is not forgotten.
     pub fn raise(&mut self, seen: &[(u32, f32)]) {
         for (cell, density) in seen {
@@ -107,8 +117,7 @@ impl OccupancyGrid {
         let offset = (turn % TURNS) as usize;
         self.values.par_chunks_mut(PIECE).enumerate().for_each(|(piece, values)| {
             let mut rng = rng(seed, turn.wrapping_mul(1 << 20) + piece as u64);
-            let cells: Vec<usize> =
-                (0..values.len())
+            let cells: Vec<usize> = (0..values.len())
                 .filter(|i| !self.closed[piece * PIECE + i])
                 .filter(|i| all || (piece * PIECE + i) % TURNS as usize == offset)
                 .collect();
@@ -135,8 +144,24 @@ impl OccupancyGrid {
         if n == 0 { f32::INFINITY } else { (sum / f64::from(n)) as f32 }
     }
 
+    /// Everything that a checkpoint holds; call [`Self::restored`] after reading it.
+    pub fn buffers(&mut self) -> [&mut Vec<f32>; 2] {
+        [&mut self.values, &mut self.threshold]
+    }
+
+    /// Lengths of the buffers.
+    pub fn lengths(&self) -> [usize; 2] {
+        [self.occupied.len(), 1]
+    }
+
+    /// Decides again as the checkpoint's run had decided last.
+    pub fn restored(&mut self) {
+        self.decide(self.threshold[0]);
+    }
+
     /// Marks the cells whose value exceeds the threshold.
     pub fn decide(&mut self, threshold: f32) {
+        self.threshold[0] = threshold;
         let cells = self.occupied.par_iter_mut().zip(&self.values).zip(&self.closed);
         cells.for_each(|((o, v), closed)| *o = *v > threshold && !closed);
     }

@@ -122,9 +122,9 @@ impl Region {
 /// Whether a point of the world lies in a view's picture.
 fn shows(view: &View, p_in_world: &Point3<f64>) -> bool {
     let size = view.size();
-    view.intrinsics.img_from_cam(&(view.world_from_cam.inverse() * *p_in_world)).is_some_and(|p| {
-        p.x >= -0.5 && p.y >= -0.5 && p.x < size.width as f64 - 0.5 && p.y < size.height as f64 - 0.5
-    })
+    view.intrinsics
+        .img_from_cam(&(view.world_from_cam.inverse() * *p_in_world))
+        .is_some_and(|p| p.x >= -0.5 && p.y >= -0.5 && p.x < size.width as f64 - 0.5 && p.y < size.height as f64 - 0.5)
 }
 
 /// The box around a view's mask, in pixels (z = 0); `None` where the mask is empty.

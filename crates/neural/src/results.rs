@@ -77,7 +77,9 @@ pub fn write_film(path: &Path, images: &[RgbImage], frames_per_second: f64) -> R
         .stdout(Stdio::null())
         .stderr(Stdio::piped())
         .spawn()
-        .map_err(|e| failed(format!("a film needs the command ffmpeg, which did not start ({e}); the pictures are written")))?;
+        .map_err(|e| {
+            failed(format!("a film needs the command ffmpeg, which did not start ({e}); the pictures are written"))
+        })?;
     if let Some(mut pipe) = child.stdin.take() {
         for image in images {
             // A broken pipe is told below, by what ffmpeg says.

@@ -614,14 +614,20 @@ mod tests {
                     loss_at(&field, &positions, &rays)
                 };
                 let (found, expected) = (f64::from(worker.d_positions[s][d]), (at(1e-3) - at(-1e-3)) / 2e-3);
-                assert!((found - expected).abs() < 0.02 * expected.abs().max(0.5), "position: {found} is not {expected}");
+                assert!(
+                    (found - expected).abs() < 0.02 * expected.abs().max(0.5),
+                    "position: {found} is not {expected}"
+                );
                 let at = |h: f32| {
                     let mut rays = rays;
                     rays[s / 3].1[d] += h;
                     loss_at(&field, &positions, &rays)
                 };
                 let (found, expected) = (f64::from(worker.d_directions[s / 3][d]), (at(1e-2) - at(-1e-2)) / 2e-2);
-                assert!((found - expected).abs() < 0.02 * expected.abs().max(0.5), "direction: {found} is not {expected}");
+                assert!(
+                    (found - expected).abs() < 0.02 * expected.abs().max(0.5),
+                    "direction: {found} is not {expected}"
+                );
             }
             field.collect(std::iter::once(&mut worker));
             // One step of plain descent along each buffer must change the loss as the derivative says.

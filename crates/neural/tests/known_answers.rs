@@ -242,8 +242,9 @@ fn state(model: &mut dyn Model, cameras: &mut CameraResiduals) -> Vec<f32> {
 fn a_stopped_and_resumed_run_ends_with_the_same_bytes_for_any_thread_count() {
     let correcting = CameraOptions { refine_poses: true, refine_focal: true, start: 1, ..CameraOptions::default() };
     for with_masks in [true, false] {
-        let images =
-            photographs(4, ball(0.06)).into_iter().map(|(rgb, mask, k, pose)| (rgb, mask.filter(|_| with_masks), k, pose));
+        let images = photographs(4, ball(0.06))
+            .into_iter()
+            .map(|(rgb, mask, k, pose)| (rgb, mask.filter(|_| with_masks), k, pose));
         let data = RayDataset::from_images(images.collect(), 0).expect("4 good views");
         let json = serde_json::json!({"run": 1});
         let straight = |threads: usize| -> Vec<Vec<f32>> {
@@ -335,8 +336,7 @@ fn a_sequence_on_disk_becomes_a_mesh_and_pictures() {
     assert!(summary.training.cameras.expect("cameras are corrected").center_mm > 0.0);
     assert_eq!(mb_capture::PoseFolder::open(&cameras).expect("poses").frames().len(), 9);
     let out = dir.path().join("views");
-    let mut views =
-        Views { path: CameraPath::HeldOut, out: out.clone(), film: None, frames_per_second: 30.0 };
+    let mut views = Views { path: CameraPath::HeldOut, out: out.clone(), film: None, frames_per_second: 30.0 };
     options.run.previews = Some(dir.path().join("previews"));
     options.run.checkpoint = Some(dir.path().join("trained"));
     let summary = synthesize(&sequence, &options, &views, &Silent).expect("pictures");

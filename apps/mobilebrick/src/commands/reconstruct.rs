@@ -203,12 +203,12 @@ fn beside(out: &Path, ending: &str) -> PathBuf {
 
 fn read_options(file: &Path, method: &str) -> Result<FieldOptions> {
     let text = std::fs::read_to_string(file).map_err(|e| InputError::unreadable(file, &e))?;
-    let wrong = |found: String| {
-        InputError::new(file, found).help("Take the file that lies beside a result of the same method")
-    };
+    let wrong =
+        |found: String| InputError::new(file, found).help("Take the file that lies beside a result of the same method");
     let json: serde_json::Value = serde_json::from_str(&text).map_err(|e| wrong(format!("not JSON ({e})")))?;
     let inner = json.get("options").cloned().unwrap_or(json);
-    let options: FieldOptions = serde_json::from_value(inner).map_err(|e| wrong(format!("not the options of a field ({e})")))?;
+    let options: FieldOptions =
+        serde_json::from_value(inner).map_err(|e| wrong(format!("not the options of a field ({e})")))?;
     match options.method.name() == method {
         true => Ok(options),
         false => Err(wrong(format!("the options of {}, not of {method}", options.method.name())).into()),
