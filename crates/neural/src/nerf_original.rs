@@ -208,14 +208,14 @@ impl NerfOriginal {
         rays: &[SceneRay],
         backgrounds: &[[f32; 3]],
         mut rng: Option<&mut Rng>,
-        coarse: (&mut Samples, &mut FrequencyWorker<3>),
-        fine: (&mut Samples, &mut FrequencyWorker<3>),
+        (coarse, coarse_worker): (&mut Samples, &mut FrequencyWorker<3>),
+        (fine, fine_worker): (&mut Samples, &mut FrequencyWorker<3>),
     ) {
         let depths: Vec<_> = rays.iter().map(|ray| self.coarse_depths(ray, rng.as_deref_mut())).collect();
-        self.place(rays, depths.into_iter(), coarse.0);
-        self.shade(&self.coarse, rays, backgrounds, coarse.0, coarse.1);
+        self.place(rays, depths.into_iter(), coarse);
+        self.shade(&self.coarse, rays, backgrounds, coarse, coarse_worker);
         let n = self.options.coarse_samples;
-        let places = coarse.0.depths.chunks_exact(n).zip(coarse.0.weights.chunks_exact(n));
+        let places = coarse.depths.chunks_exact(n).zip(coarse.weights.chunks_exact(n));
         let both: Vec<Vec<f32>> = places
             .map(|(depths, weights)| {
                 // Between the middles of neighbours, weighted by the sample inside; the two at the ends are left out.
@@ -227,8 +227,8 @@ impl NerfOriginal {
                 all
             })
             .collect();
-        self.place(rays, both.into_iter(), fine.0);
-        self.shade(&self.fine, rays, backgrounds, fine.0, fine.1);
+        self.place(rays, both.into_iter(), fine);
+        self.shade(&self.fine, rays, backgrounds, fine, fine_worker);
     }
 
     fn run_group(
