@@ -8,10 +8,13 @@
 //! - [`align_refine`]: the object's pose and each photograph's drift, from the model's edges in the photographs.
 //! - [`align_bundle`]: every camera, from features on the model and beside it, the model's edges, and the phone's poses.
 //!
+//! [`align_board`] gives reference cameras from a calibration board in view, to measure all of these against.
+//!
 //! [`detect_features`] and [`match_features`] are of use on their own. Every estimate comes with the evidence for it: residuals, which input was left out and why, and a covariance. Input
 //! that determines no answer is told apart and explained, never answered with a guess.
 
 mod adjust;
+mod board;
 mod bundle;
 mod contour;
 mod features;
@@ -27,6 +30,10 @@ mod scale_space;
 mod sqpnp;
 mod tracks;
 
+pub use board::{
+    BoardFrame, BoardOptions, BoardOutcome, BoardSummary, CalibratedPhoto, CalibrationSummary, PhotoCalibration,
+    align_board, calibrate_photos,
+};
 pub use bundle::{BundleOptions, BundleSummary, BundledFrame, Dropped, align_bundle};
 pub use features::{Feature, FeatureOptions, detect_features};
 pub use keypoints::{KeypointOptions, KeypointResidual, KeypointSummary, align_keypoints};

@@ -5,7 +5,8 @@
 //! - `object`: each camera's pose in the object's frame, the error that ground truth inherits. It needs the object's
 //!   pose on both sides.
 //! - `ate`: distances of the camera centres after the best rigid alignment of the predicted ones (Sturm et al. 2012, "A
-//!   benchmark for the evaluation of RGB-D SLAM systems", section VI); `rpe`: relative poses of neighbouring frames.
+//!   benchmark for the evaluation of RGB-D SLAM systems", section VI), and beside it without alignment and after the best
+//!   similarity (`evo_ape` as it is, with `-a` and with `-as`); `rpe`: relative poses of neighbouring frames.
 
 use std::path::Path;
 
@@ -34,6 +35,10 @@ pub struct PosesScores {
     pub ate_rmse_mm: f64,
     /// Mean angle between the cameras' rotations after the same alignment, degrees.
     pub ate_rotation_mean_deg: f64,
+    /// Poses as they are, for two sides that share a world; large and without meaning where they do not.
+    pub ate_unaligned: PoseErrors,
+    /// Poses after the similarity that brings the predicted centres closest; `None` where nothing determines its scale.
+    pub ate_similarity: Option<PoseErrors>,
     /// Length of a predicted metre in reference metres, from the best similarity; `None` where nothing determines it.
     pub scale: Option<f64>,
     /// Relative poses of neighbouring frames, in the order of their numbers.
@@ -187,7 +192,16 @@ pub fn score_poses(pairs: &[PosePair], object: Option<&ObjectPair>) -> Result<Po
         .rigid;
     let aligned: Tally =
         pairs.iter().map(|p| error_of(&p.gt_world_from_cam, &(gt_from_pred * p.pred_world_from_cam))).collect();
-    let scale = Sim3::<World, World>::align_any(&gt, &pred, true).map(|sim| sim.scale);
+    let unaligned: Tally = pairs.iter().map(|p| error_of(&p.gt_world_from_cam, &p.pred_world_from_cam)).collect();
+    let similarity = Sim3::<World, World>::align_any(&gt, &pred, true);
+    let scaled = similarity.map(|sim| {
+        let moved = |p: &PosePair| {
+            let center = sim.transform_point(&Point3::from(p.pred_world_from_cam.translation()));
+            Rigid3::from_parts(sim.rigid.rotation() * p.pred_world_from_cam.rotation(), center.coords)
+        };
+        pairs.iter().map(|p| error_of(&p.gt_world_from_cam, &moved(p))).collect::<Tally>().errors()
+    });
+    let scale = similarity.map(|sim| sim.scale);
 
     let mut warnings = Vec::new();
     if let Some(scale) = scale.filter(|s| !(0.9..1.1).contains(s)) {
@@ -204,6 +218,8 @@ pub fn score_poses(pairs: &[PosePair], object: Option<&ObjectPair>) -> Result<Po
         object,
         ate_rmse_mm: aligned.translation_rmse_mm,
         ate_rotation_mean_deg: aligned.rotation_mean_deg,
+        ate_unaligned: unaligned.errors(),
+        ate_similarity: scaled,
         scale,
         rpe: rpe.errors(),
         missing: Vec::new(),

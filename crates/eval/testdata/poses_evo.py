@@ -78,6 +78,10 @@ document = {
     "rpe_rotation_mean_deg": rpe(Relation.rotation_angle_deg, Statistic.mean),
     "ate_rmse_mm": 1e3 * figure(metrics.APE(Relation.translation_part), (ref, aligned), Statistic.rmse),
     "ate_rotation_mean_deg": figure(metrics.APE(Relation.rotation_angle_deg), (ref, aligned), Statistic.mean),
+    "ate_unaligned_translation_rmse_mm": 1e3 * figure(metrics.APE(Relation.translation_part), (ref, est), Statistic.rmse),
+    "ate_unaligned_rotation_mean_deg": figure(metrics.APE(Relation.rotation_angle_deg), (ref, est), Statistic.mean),
+    "ate_similarity_translation_rmse_mm": 1e3 * figure(metrics.APE(Relation.translation_part), (ref, scaled), Statistic.rmse),
+    "ate_similarity_rotation_mean_deg": figure(metrics.APE(Relation.rotation_angle_deg), (ref, scaled), Statistic.mean),
     "scale": float(scale),
 }
 Path(__file__).with_suffix(".json").write_text(json.dumps(document, indent=1) + "\n")

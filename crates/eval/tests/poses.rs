@@ -67,6 +67,10 @@ fn evo_agrees() {
         ("rpe_rotation_mean_deg", scores.rpe.rotation_mean_deg),
         ("ate_rmse_mm", scores.ate_rmse_mm),
         ("ate_rotation_mean_deg", scores.ate_rotation_mean_deg),
+        ("ate_unaligned_translation_rmse_mm", scores.ate_unaligned.translation_rmse_mm),
+        ("ate_unaligned_rotation_mean_deg", scores.ate_unaligned.rotation_mean_deg),
+        ("ate_similarity_translation_rmse_mm", scores.ate_similarity.unwrap().translation_rmse_mm),
+        ("ate_similarity_rotation_mean_deg", scores.ate_similarity.unwrap().rotation_mean_deg),
         ("scale", scores.scale.unwrap()),
     ] {
         let expected = expected[name].as_f64().unwrap();

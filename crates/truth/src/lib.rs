@@ -15,5 +15,5 @@ pub mod visibility;
 mod visible_surface;
 
 pub use exact_scene::ExactScene;
-pub use pose_study::{PoseStudy, PoseStudyOptions, perturbed_pose_study};
+pub use pose_study::{PoseStudy, PoseStudyOptions, common_motion, perturbed_pose_study};
 pub use truth::{TruthOptions, TruthSummary, truth};

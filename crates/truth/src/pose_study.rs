@@ -114,7 +114,7 @@ pub fn perturbed_pose_study(
 
 /// The rigid motion of the world that brings the perturbed cameras nearest to the true ones: the mean of the frames'
 /// corrections on SE(3), by Karcher's iteration.
-fn common_motion(truth: &[Rigid3<World, Camera>], perturbed: &[Rigid3<World, Camera>]) -> Rigid3<World, World> {
+pub fn common_motion(truth: &[Rigid3<World, Camera>], perturbed: &[Rigid3<World, Camera>]) -> Rigid3<World, World> {
     let mut mean = Rigid3::identity();
     // Corrections of a few degrees converge to rounding in three or four steps.
     for _ in 0..10 {

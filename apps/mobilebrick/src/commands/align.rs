@@ -1,9 +1,10 @@
 //! `align`: where the object and the cameras are.
 
 use clap::{Args, Subcommand};
-use mb_align::{BundleOptions, RefineOptions};
+use mb_align::{BoardOptions, BundleOptions, RefineOptions};
 use mb_job::Result;
 
+use super::board::BoardArgument;
 use super::{Seed, SequenceArgument};
 use crate::outcome::Outcome;
 use crate::terminal::Terminal;
@@ -17,6 +18,8 @@ pub enum Align {
     Refine(Refine),
     /// Every camera, with the model as the map; starts from an alignment
     Bundle(Bundle),
+    /// Reference cameras from a calibration board in view (written to board/)
+    Board(Board),
 }
 
 impl Align {
@@ -26,6 +29,7 @@ impl Align {
             Self::Keypoints(c) => c.run(terminal),
             Self::Refine(c) => c.run(terminal),
             Self::Bundle(c) => c.run(terminal),
+            Self::Board(c) => c.run(terminal),
         }
     }
 }
@@ -127,6 +131,37 @@ impl Bundle {
             summary.free_points,
             summary.rms_px,
             summary.moved_rms_mm
+        );
+        Outcome::new(&summary, text)
+    }
+}
+
+/// Reference cameras from a calibration board in view (written to board/)
+#[derive(Debug, Args)]
+pub struct Board {
+    #[command(flatten)]
+    sequence: SequenceArgument,
+
+    #[command(flatten)]
+    board: BoardArgument,
+
+    /// Estimate one camera with a lens for all frames, in the place of intrinsic/
+    #[arg(long)]
+    calibrate: bool,
+}
+
+impl Board {
+    fn run(&self, terminal: &Terminal) -> Result<Outcome> {
+        let options = BoardOptions { calibrate: self.calibrate };
+        let board = self.board.parse()?;
+        let summary = mb_align::align_board(&self.sequence.open()?, &board, &options, terminal)?;
+        let text = format!(
+            "{} of {} frames posed from {} corners, {:.3} px rms\nwrote {}",
+            summary.posed,
+            summary.frames.len(),
+            summary.corners,
+            summary.rms_px,
+            summary.written.display()
         );
         Outcome::new(&summary, text)
     }

@@ -3,6 +3,7 @@
 
 mod align;
 mod bench;
+mod board;
 mod capture;
 mod demo;
 mod eval;
@@ -35,6 +36,9 @@ pub enum Command {
     /// Where the object and the cameras are
     #[command(subcommand)]
     Align(align::Align),
+    /// Calibration boards: print one, or calibrate a camera with it
+    #[command(subcommand)]
+    Board(board::Board),
     /// Exact depth, masks, visible surface and visibility volume of an aligned sequence
     Truth(truth::Truth),
     /// Reconstruct a sequence's surface with one of the methods
@@ -59,6 +63,7 @@ impl Command {
             Self::Model(c) => c.run(terminal),
             Self::Capture(c) => c.run(terminal),
             Self::Align(c) => c.run(terminal),
+            Self::Board(c) => c.run(terminal),
             Self::Truth(c) => c.run(terminal),
             Self::Reconstruct(c) => c.run(terminal),
             Self::Synthesize(c) => c.run(terminal),

@@ -1,6 +1,7 @@
 //! `bench`: methods beside each other, one file a subcommand.
 
 mod leaderboard;
+mod poses;
 mod table;
 
 use std::path::Path;
@@ -18,6 +19,8 @@ pub enum Bench {
     Table(table::Table),
     /// A static site of scores: rankings, a page per sequence with renders, heat maps and curves, provenance
     Leaderboard(leaderboard::Leaderboard),
+    /// The paper's study of camera poses: the phone's and the aligned ones against those of a board in view
+    Poses(poses::Poses),
 }
 
 impl Bench {
@@ -26,6 +29,7 @@ impl Bench {
         match self {
             Self::Table(c) => c.run(),
             Self::Leaderboard(c) => c.run(terminal),
+            Self::Poses(c) => c.run(terminal),
         }
     }
 }
