@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use mb_capture::{Alignment, AlignmentStage, Frame, FrameAlignment, FrameId, Sequence, read_pose_txt, write_pose_txt};
+use mb_capture::{
+    Alignment, AlignmentStage, Frame, FrameAlignment, FrameId, Sequence, write_intrinsics_txt, write_pose_txt,
+};
 use mb_geometry::{Camera, Object, Ray, Rigid3, World};
 use mb_job::{Error, Progress, Result, Steps, write_atomic};
 use mb_mesh::{Bvh, TriangleMesh, read_mesh};
@@ -15,7 +17,8 @@ use crate::adjust::{AdjustedCamera, AdjustedPoint, Adjustment, CameraTerm, Point
 use crate::contour::{ContourFit, ContourFrame, DriftPrior};
 use crate::features::{FeatureOptions, detect_features};
 use crate::model_edges::{ModelEdges, view_at};
-use crate::output::{BUNDLE, begin_stage, rows};
+use crate::outcome::FrameOutcome;
+use crate::output::{BUNDLE, begin_stage, keep_phone_cameras, phone_frames, rows};
 use crate::pnp::about_origin;
 use crate::profile::Pyramid;
 use crate::tracks::{FeatureRef, TrackFrame, TrackOptions, find_tracks, triangulate};
@@ -36,6 +39,8 @@ pub struct BundleOptions {
     pub contours: bool,
     /// Whether the change of drift between neighbouring frames is held small.
     pub relative_poses: bool,
+    /// Whether each frame's focal length is estimated: for cameras whose intrinsics are not those of every frame.
+    pub focal: bool,
     /// Times that points are lifted anew, edges looked for anew, and wrong matches sorted out anew, at least 1.
     pub rounds: usize,
     /// Edge samples used of each photograph.
@@ -59,6 +64,7 @@ impl Default for BundleOptions {
             free_points: true,
             contours: true,
             relative_poses: true,
+            focal: false,
             rounds: 3,
             edge_samples: 800,
             feature_px: 0.7,
@@ -110,6 +116,8 @@ pub struct Dropped {
 pub struct BundledFrame {
     /// Which frame.
     pub frame: FrameId,
+    /// What became of it.
+    pub outcome: FrameOutcome,
     /// Features that took part.
     pub observations: usize,
     /// Their root mean square residual, pixels; `None` without any.
@@ -120,6 +128,8 @@ pub struct BundledFrame {
     pub moved_mm: f64,
     /// Standard deviation of the camera's position given the object, millimetres.
     pub position_std_mm: f64,
+    /// Focal length over the phone's; 1 where it was not estimated.
+    pub focal_ratio: f64,
 }
 
 /// Matches whose points on the model are further apart are wrong (Li et al. 2023, section 3.3), metres.
@@ -128,10 +138,18 @@ const APART_M: f64 = 0.02;
 const SURFACE_M: f64 = 3e-4;
 /// Residual beyond which an observation is left out, pixels, by round; the last repeats.
 const LIMITS_PX: [f64; 3] = [12.0, 4.0, 3.0];
+/// Standard deviation of a focal length that is not known of each frame, as a share: autofocus moves it by this much.
+const FOCAL: f64 = 0.01;
 /// Distance across an edge within which the photograph's edge is the model's, pixels.
 const EDGE_LIMIT_PX: f64 = 2.5;
 /// Features below which a frame hangs by its edges and neighbours alone.
 const FEW: usize = 20;
+/// Features below which a frame's own say nothing.
+const LEAST: usize = 6;
+/// Share of the model's edges below which those found are there by chance.
+const FEW_EDGES: f64 = 0.3;
+/// Share of the model's edges that determines a camera by itself.
+const MANY_EDGES: f64 = 0.5;
 
 /// Refines every camera of an aligned sequence, with the object's pose held.
 ///
@@ -149,11 +167,10 @@ pub fn align_bundle(sequence: &Sequence, options: &BundleOptions, progress: &dyn
     let mesh = read_mesh(sequence.model_mesh_path())?;
     let world_from_object = start.world_from_object;
     let frames = sequence.aligned_frames(&start);
-    if let Some(frame) = frames.iter().find(|f| f.image.is_none()) {
-        let found = format!("frame {} has no photograph, but bundle adjustment needs one of every frame", frame.id);
-        return Err(Error::input(sequence.root().join("image"), found));
+    if frames.iter().all(|f| f.image.is_none()) {
+        return Err(Error::input(sequence.root().join("image"), "no photographs to find the model in"));
     }
-    let phone = phone_poses(sequence)?;
+    let phone = phone_frames(sequence)?;
 
     let steps = Steps::new(progress, "bundle adjustment", frames.len() + options.rounds.max(1) + 2);
     let mut edges = ModelEdges::new(&mesh, options.seed);
@@ -166,7 +183,12 @@ pub fn align_bundle(sequence: &Sequence, options: &BundleOptions, progress: &dyn
         .par_iter()
         .zip(&phone)
         .map(|(frame, phone)| {
-            let image = sequence.read_image(frame)?;
+            // A frame without a photograph is one that shows nothing.
+            let image = if frame.image.is_some() {
+                sequence.read_image(frame)?
+            } else {
+                mb_image::Image::filled(size, [0u8; 3])
+            };
             let features = detect_features(
                 &image,
                 // Small photographs have few features unless they are enlarged.
@@ -186,8 +208,8 @@ pub fn align_bundle(sequence: &Sequence, options: &BundleOptions, progress: &dyn
             let contour = ContourFrame {
                 intrinsics: frame.intrinsics,
                 size,
-                cam_from_world: phone.inverse(),
-                drift: *phone * frame.world_from_cam.inverse(),
+                cam_from_world: phone.world_from_cam.inverse(),
+                drift: phone.world_from_cam * frame.world_from_cam.inverse(),
                 pyramid: Pyramid::new(image, 0),
             };
             steps.step()?;
@@ -197,8 +219,15 @@ pub fn align_bundle(sequence: &Sequence, options: &BundleOptions, progress: &dyn
     let (mut tracked, contours): (Vec<TrackFrame>, Vec<ContourFrame>) =
         read.into_iter().collect::<Result<Vec<_>>>()?.into_iter().unzip();
     let prior = DriftPrior { rotation_rad: options.drift_deg.to_radians(), translation_m: options.drift_mm * 1e-3 };
-    let mut fit =
-        ContourFit { edges: &edges, frames: contours, world_from_object, prior, samples: options.edge_samples };
+    let mut fit = ContourFit {
+        edges: &edges,
+        frames: contours,
+        world_from_object,
+        log_scale: 0.0,
+        scale_information: f64::INFINITY,
+        prior,
+        samples: options.edge_samples,
+    };
 
     let model = Map { scene: Scene::new(&mesh), bvh: Bvh::new(&mesh), mesh: &mesh, world_from_object };
     model.render(&mut tracked);
@@ -214,7 +243,13 @@ pub fn align_bundle(sequence: &Sequence, options: &BundleOptions, progress: &dyn
         cameras: fit
             .frames
             .iter()
-            .map(|f| AdjustedCamera { intrinsics: f.intrinsics, cam_from_world: f.cam_from_world, drift: f.drift })
+            .zip(&phone)
+            .map(|(f, phone)| AdjustedCamera {
+                intrinsics: phone.intrinsics,
+                cam_from_world: f.cam_from_world,
+                drift: f.drift,
+                log_focal: 0.0,
+            })
             .collect(),
         points: Vec::new(),
         center: fit.center(),
@@ -222,6 +257,7 @@ pub fn align_bundle(sequence: &Sequence, options: &BundleOptions, progress: &dyn
         surface_m: SURFACE_M,
         drift_information: information,
         step_information,
+        focal_information: if options.focal { FOCAL.powi(-2) } else { f64::INFINITY },
     };
     let mut dropped = Dropped::default();
     let mut covariances = None;
@@ -243,7 +279,8 @@ pub fn align_bundle(sequence: &Sequence, options: &BundleOptions, progress: &dyn
         covariances = adjustment.solve(&terms, 10);
         for ((camera, frame), track) in adjustment.cameras.iter().zip(&mut fit.frames).zip(&mut tracked) {
             frame.drift = camera.drift;
-            track.world_from_cam = (camera.cam_from_world * camera.drift).inverse();
+            (frame.intrinsics, track.intrinsics) = (camera.adjusted_intrinsics(), camera.adjusted_intrinsics());
+            track.world_from_cam = camera.adjusted_cam_from_world().inverse();
         }
         steps.step()?;
     }
@@ -255,22 +292,6 @@ pub fn align_bundle(sequence: &Sequence, options: &BundleOptions, progress: &dyn
     write(sequence, &adjustment, &phone, &start, &covariances, &summary)?;
     steps.step()?;
     Ok(summary)
-}
-
-/// The phone's own poses, in frame order.
-fn phone_poses(sequence: &Sequence) -> Result<Vec<Rigid3<World, Camera>>> {
-    sequence
-        .frames()
-        .iter()
-        .map(|frame| {
-            let kept = phone_pose_path(sequence, frame.id);
-            if kept.exists() { Ok(read_pose_txt(kept)?.0) } else { Ok(frame.world_from_cam) }
-        })
-        .collect()
-}
-
-fn phone_pose_path(sequence: &Sequence, id: FrameId) -> PathBuf {
-    sequence.root().join("pose_arkit").join(format!("{id}.txt"))
 }
 
 /// The aligned model.
@@ -381,14 +402,25 @@ fn sort_out(adjustment: &mut Adjustment, limit_px: f64, dropped: &mut Dropped) {
     adjustment.points = points;
 }
 
+fn outcome(observations: usize, edge_agreement: Option<f64>) -> FrameOutcome {
+    let edges = edge_agreement.unwrap_or(0.0);
+    if edges >= MANY_EDGES || (observations >= FEW && (edge_agreement.is_none() || edges >= FEW_EDGES)) {
+        FrameOutcome::Solved
+    } else if observations < LEAST && edges < FEW_EDGES {
+        FrameOutcome::Unseen
+    } else {
+        FrameOutcome::Weak
+    }
+}
+
 fn world_from_cam(camera: &AdjustedCamera) -> Rigid3<World, Camera> {
-    (camera.cam_from_world * camera.drift).inverse()
+    camera.adjusted_cam_from_world().inverse()
 }
 
 fn summarise(
     sequence: &Sequence,
     adjustment: &Adjustment,
-    phone: &[Rigid3<World, Camera>],
+    phone: &[Frame],
     covariances: &[Matrix6<f64>],
     edge_agreement: &[f64],
     dropped: Dropped,
@@ -410,34 +442,41 @@ fn summarise(
             let camera = world_from_cam(&adjustment.cameras[i]);
             let covariance = camera_covariance(&covariances[i], &adjustment.center);
             let position = position_covariance(&covariance, &camera.translation());
+            let edge_agreement = edge_agreement.get(i).copied();
             BundledFrame {
                 frame: frame.id,
+                outcome: outcome(sums[i].0, edge_agreement),
                 observations: sums[i].0,
                 rms_px: (sums[i].0 > 0).then(|| (sums[i].1 / sums[i].0 as f64).sqrt()),
-                edge_agreement: edge_agreement.get(i).copied(),
-                moved_mm: (camera.translation() - phone[i].translation()).norm() * 1e3,
+                edge_agreement,
+                moved_mm: (camera.translation() - phone[i].world_from_cam.translation()).norm() * 1e3,
                 position_std_mm: position.sqrt() * 1e3,
+                focal_ratio: adjustment.cameras[i].log_focal.exp(),
             }
         })
         .collect();
     let (observations, sum_sq) = sums.iter().fold((0, 0.0), |(n, s), (m, t)| (n + m, s + t));
     let n = frames.len() as f64;
     let surface_points = adjustment.points.iter().filter(|p| p.surface.is_some()).count();
-    let mut warnings: Vec<String> = frames
-        .iter()
-        .filter(|f| f.observations < FEW)
-        .map(|f| {
-            format!(
-                "frame {}: only {} features in common with other frames (blurred or dark?)",
-                f.frame, f.observations
-            )
-        })
-        .collect();
-    let doubtful = |f: &&BundledFrame| f.edge_agreement.is_some_and(|a| a < 0.3);
-    warnings.extend(frames.iter().filter(doubtful).map(|f| {
-        let share = 100.0 * f.edge_agreement.unwrap_or_default();
-        format!("frame {}: only {share:.0} % of the model's edges were found (did the object move?)", f.frame)
-    }));
+    let mut warnings = Vec::new();
+    for f in &frames {
+        let share = f.edge_agreement.map_or(String::new(), |a| format!(", {:.0} % of the model's edges", 100.0 * a));
+        let seen = format!("{} features in common with other frames{share}", f.observations);
+        match f.outcome {
+            FrameOutcome::Solved => {}
+            FrameOutcome::Weak => {
+                warnings.push(format!("frame {}: only {seen} (blurred, dark, or did the object move?)", f.frame));
+            }
+            FrameOutcome::Unseen => warnings
+                .push(format!("frame {}: nothing of use ({seen}); its drift is taken from its neighbours", f.frame)),
+        }
+    }
+    let by_edges = frames.iter().filter(|f| f.outcome == FrameOutcome::Solved && f.observations < FEW).count();
+    if by_edges > 0 {
+        warnings.push(format!(
+            "{by_edges} frames have fewer than {FEW} features in common with others: their cameras rest on the model's edges"
+        ));
+    }
     BundleSummary {
         surface_points,
         free_points: adjustment.points.len() - surface_points,
@@ -471,21 +510,21 @@ fn position_covariance(covariance: &Matrix6<f64>, p: &Vector3<f64>) -> f64 {
 fn write(
     sequence: &Sequence,
     adjustment: &Adjustment,
-    phone: &[Rigid3<World, Camera>],
+    phone: &[Frame],
     start: &Alignment,
     covariances: &[Matrix6<f64>],
     summary: &BundleSummary,
 ) -> Result<()> {
+    let focal = adjustment.focal_information.is_finite();
+    keep_phone_cameras(sequence, phone, focal)?;
     let ids = sequence.frames().iter().map(|f| f.id);
-    for (id, pose) in ids.clone().zip(phone) {
-        let path = phone_pose_path(sequence, id);
-        if !path.exists() {
-            write_pose_txt(path, pose)?;
-        }
-    }
     let written = begin_stage(sequence)?;
     for (id, camera) in ids.clone().zip(&adjustment.cameras) {
-        write_pose_txt(sequence.root().join("pose").join(format!("{id}.txt")), &world_from_cam(camera))?;
+        let name = format!("{id}.txt");
+        write_pose_txt(sequence.root().join("pose").join(&name), &world_from_cam(camera))?;
+        if focal {
+            write_intrinsics_txt(sequence.root().join("intrinsic").join(&name), &camera.adjusted_intrinsics())?;
+        }
     }
     let frames = ids
         .zip(&adjustment.cameras)

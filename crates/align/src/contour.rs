@@ -1,11 +1,14 @@
 //! The pose of the object, and small motions of each camera, from edges of the model in photographs.
 
 use mb_geometry::{Camera, ImageSize, Intrinsics, Object, Rigid3, World};
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Point2, RowVector6, UnitQuaternion, Vector2, Vector3, Vector6};
+use nalgebra::{
+    DMatrix, DVector, Matrix3, Matrix6, Point2, Point3, RowSVector, RowVector6, SMatrix, SVector, UnitQuaternion,
+    Vector2, Vector3, Vector6,
+};
 use rayon::prelude::*;
 
 use crate::adjust::CameraTerm;
-use crate::model_edges::{ModelEdges, VisibleSample, view_at};
+use crate::model_edges::{EdgeKind, ModelEdges, VisibleSample, image_normal, view_at};
 use crate::pnp_problem::{moved, project};
 use crate::profile::{Candidates, MAX_RANGE_PX, Pyramid, candidates};
 
@@ -37,6 +40,10 @@ pub(crate) struct ContourFit<'a> {
     pub edges: &'a ModelEdges,
     pub frames: Vec<ContourFrame>,
     pub world_from_object: Rigid3<World, Object>,
+    /// Logarithm of the object's size over the model's, as the phone measures it; the object grows about its middle.
+    pub log_scale: f64,
+    /// Information of `log_scale`; infinite where the model's size is exact.
+    pub scale_information: f64,
     pub prior: DriftPrior,
     /// Samples used of each frame.
     pub samples: usize,
@@ -60,6 +67,7 @@ struct Projection {
     k: Intrinsics,
     center: Vector3<f64>,
     world_from_object: Rigid3<World, Object>,
+    scale: f64,
     drift: Rigid3<World, World>,
     cam_from_world: (Matrix3<f64>, Vector3<f64>),
     cam_from_drifted: (Matrix3<f64>, Vector3<f64>),
@@ -70,40 +78,101 @@ struct Residual {
     /// Signed distance across the edge, from the model's edge to the nearest of the photograph's; pixels of the level.
     px: f64,
     /// Derivatives of the model's edge with respect to motions of the object and of the frame's drift.
-    by_object: RowVector6<f64>,
+    by_object: RowSVector<f64, OBJECT>,
     by_drift: RowVector6<f64>,
 }
 
 impl Projection {
     fn residual(&self, o: &Observation) -> Option<Residual> {
-        let in_world = self.world_from_object * o.visible.sample.point_in_object;
+        let from_center =
+            ((self.world_from_object * o.visible.sample.point_in_object).coords - self.center) * self.scale;
+        let in_world = Point3::from(self.center + from_center);
         let drifted = (self.drift * in_world).coords;
         let (r, t) = &self.cam_from_world;
         let (pixel, by_drift) = project(&self.k, r, t, &drifted, &self.center)?;
         let (r, t) = &self.cam_from_drifted;
-        let (_, by_object) = project(&self.k, r, t, &in_world.coords, &self.center)?;
+        let (_, by_motion) = project(&self.k, r, t, &in_world.coords, &self.center)?;
         let n = o.visible.normal;
         let along = n.dot(&(pixel - o.visible.pixel));
         let offsets = o.candidates.as_slice().iter().map(|offset| offset - along);
         let px = offsets.min_by(|a, b| a.abs().total_cmp(&b.abs()))?;
-        Some(Residual { px, by_object: n.transpose() * by_object, by_drift: n.transpose() * by_drift })
+        let by_motion = n.transpose() * by_motion;
+        let mut by_object = RowSVector::<f64, OBJECT>::zeros();
+        by_object.fixed_columns_mut::<6>(0).copy_from(&by_motion);
+        by_object[6] = (by_motion.fixed_columns::<3>(3) * from_center)[0];
+        Some(Residual { px, by_object, by_drift: n.transpose() * by_drift })
     }
 }
 
+/// Unknowns of the object: turn, shift, logarithm of its scale.
+const OBJECT: usize = 7;
+type ObjectMatrix = SMatrix<f64, OBJECT, OBJECT>;
+type ObjectVector = SVector<f64, OBJECT>;
+/// Stands for an infinite information of the scale: nothing that edges say comes near.
+const EXACT: f64 = 1e15;
+
 /// Gauss-Newton's equations: the object's motion, and each frame's.
 struct Equations {
-    object: Matrix6<f64>,
-    object_right: Vector6<f64>,
+    object: ObjectMatrix,
+    object_right: ObjectVector,
     frames: Vec<FrameEquations>,
 }
 
 struct FrameEquations {
     /// Rows: the object; columns: the frame.
-    mixed: Matrix6<f64>,
+    mixed: SMatrix<f64, OBJECT, 6>,
     own: Matrix6<f64>,
-    object: Matrix6<f64>,
+    object: ObjectMatrix,
     right: Vector6<f64>,
-    object_right: Vector6<f64>,
+    object_right: ObjectVector,
+}
+
+/// Standard deviation of residuals by kind of edge, pixels.
+#[derive(Clone, Copy)]
+struct Noise([f64; EdgeKind::COUNT]);
+
+impl Noise {
+    /// Of an observation, its information and the residual from which it does not count.
+    fn of(&self, o: &Observation, limit_px: f64) -> (f64, f64) {
+        let noise_px = self.0[o.visible.kind as usize];
+        ((CORRELATION * noise_px).powi(-2), limit_px.min(TUKEY * noise_px))
+    }
+}
+
+/// Tukey's biweight with this limit in standard deviations is 95 % as efficient as least squares on normal errors.
+const TUKEY: f64 = 4.685;
+
+/// How many of the model's visible edges photographs show.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Agreement {
+    /// Those found where they should be, by how near they are.
+    found: f64,
+    /// Those found where the model is not.
+    by_chance: f64,
+    samples: f64,
+}
+
+impl Agreement {
+    pub fn of_all(frames: &[Self]) -> Self {
+        frames.iter().fold(Self::default(), |a, b| Self {
+            found: a.found + b.found,
+            by_chance: a.by_chance + b.by_chance,
+            samples: a.samples + b.samples,
+        })
+    }
+
+    pub fn share(&self) -> f64 {
+        self.found / self.samples.max(1.0)
+    }
+
+    pub fn chance(&self) -> f64 {
+        self.by_chance / self.samples.max(1.0)
+    }
+
+    /// 0 = no better than chance, 1 = every edge found.
+    pub fn confidence(&self) -> f64 {
+        ((self.share() - self.chance()) / (1.0 - self.chance()).max(1e-9)).clamp(0.0, 1.0)
+    }
 }
 
 /// How well the fit is known. Motions are about the object's middle, `[rotation; translation]`.
@@ -118,7 +187,17 @@ pub(crate) struct Uncertainty {
 
 impl ContourFit<'_> {
     fn cam_from_object(&self, frame: &ContourFrame) -> Rigid3<Camera, Object> {
-        frame.cam_from_world * frame.drift * self.world_from_object
+        frame.cam_from_world * self.drift_at_true_size(frame) * self.world_from_object
+    }
+
+    /// The drift with which the camera sees the model, in its own size, exactly as it would see it scaled: an object
+    /// that is larger by a factor looks the same from that much farther away.
+    pub fn drift_at_true_size(&self, frame: &ContourFrame) -> Rigid3<World, World> {
+        let center = Point3::from(self.center());
+        let cam_from_drifted = frame.cam_from_world * frame.drift;
+        let shift =
+            (cam_from_drifted * center).coords * (-self.log_scale).exp() - cam_from_drifted.rotate(&center.coords);
+        frame.cam_from_world.inverse() * Rigid3::from_parts(cam_from_drifted.rotation(), shift)
     }
 
     /// The object's middle in the world: the motions' pivot.
@@ -138,13 +217,32 @@ impl ContourFit<'_> {
                     .visible_samples(&view, self.samples)
                     .into_iter()
                     .map(|visible| {
-                        let candidates = candidates(image, &visible.pixel, &visible.normal, range_px);
+                        let candidates = candidates(image, &visible.pixel, &visible.normal, range_px, visible.kind);
                         Observation { visible, candidates }
                     })
                     .collect()
             })
             .collect();
         Observed { level, observations }
+    }
+
+    /// Looks for the photographs' edges anew around where the same samples are now, without asking which are visible: cheap,
+    /// and right while nothing has moved by much.
+    pub fn observe_again(&self, observed: &mut Observed, range_px: usize) {
+        let level = observed.level;
+        self.frames.par_iter().zip(&mut observed.observations).for_each(|(frame, list)| {
+            let image = frame.pyramid.level(level);
+            let view = view_at(&frame.intrinsics, frame.size, &self.cam_from_object(frame), level);
+            list.retain_mut(|o| {
+                let p = view.cam_from_frame * o.visible.sample.point_in_object;
+                let pixel = view.intrinsics.img_from_cam(&p);
+                let normal = image_normal(&view.intrinsics, &view.cam_from_frame, &o.visible.sample, &p);
+                let Some((pixel, normal)) = pixel.zip(normal) else { return false };
+                (o.visible.pixel, o.visible.normal) = (pixel, normal);
+                o.candidates = candidates(image, &pixel, &normal, range_px, o.visible.kind);
+                true
+            });
+        });
     }
 
     /// The frame's projection at a level, prepared for many samples.
@@ -154,6 +252,7 @@ impl ContourFit<'_> {
             k: view_at(&frame.intrinsics, frame.size, &self.cam_from_object(frame), level).intrinsics,
             center: self.center(),
             world_from_object: self.world_from_object,
+            scale: self.log_scale.exp(),
             drift: frame.drift,
             cam_from_world: (frame.cam_from_world.rotation_matrix(), frame.cam_from_world.translation()),
             cam_from_drifted: (cam_from_drifted.rotation_matrix(), cam_from_drifted.translation()),
@@ -162,50 +261,59 @@ impl ContourFit<'_> {
 
     /// Steps towards the observed edges; residuals beyond `limit_px` do not count (Tukey's biweight).
     pub fn step(&mut self, observed: &Observed, limit_px: f64) -> bool {
-        let noise_px = self.noise_px(observed, limit_px);
-        let equations = self.equations(observed, limit_px, noise_px);
+        let noise = self.noise_px(observed, limit_px);
+        let equations = self.equations(observed, limit_px, &noise);
         let Some((object_step, frame_steps)) = equations.solve() else { return false };
         let center = self.center();
-        self.world_from_object = moved(&self.world_from_object, &object_step, &center);
+        self.world_from_object = moved(&self.world_from_object, &object_step.fixed_rows::<6>(0).into_owned(), &center);
+        if self.scale_information.is_finite() {
+            self.log_scale += object_step[6];
+        }
         for (frame, step) in self.frames.iter_mut().zip(&frame_steps) {
             frame.drift = moved(&frame.drift, step, &center);
         }
         object_step.iter().all(|v| v.is_finite())
     }
 
-    /// Standard deviation of the residuals within the limit, from their median.
-    fn noise_px(&self, observed: &Observed, limit_px: f64) -> f64 {
-        let mut lengths: Vec<f64> = self
+    /// Standard deviation of the residuals within the limit, from their median, for each kind of edge: outlines before
+    /// the table are sharp, edges of one colour inside the model are not.
+    fn noise_px(&self, observed: &Observed, limit_px: f64) -> Noise {
+        let mut lengths: Vec<(usize, f64)> = self
             .frames
             .par_iter()
             .zip(&observed.observations)
             .flat_map_iter(|(frame, list)| {
                 let projection = self.projection(frame, observed.level);
-                list.iter().filter_map(move |o| projection.residual(o)).map(|r| r.px.abs())
+                list.iter().filter_map(move |o| Some((o.visible.kind as usize, projection.residual(o)?.px.abs())))
             })
-            .filter(|r| *r < limit_px)
+            .filter(|(_, r)| *r < limit_px)
             .collect();
-        lengths.sort_by(f64::total_cmp);
-        // 1.4826 makes the median absolute deviation the standard deviation of normal errors.
-        lengths.get(lengths.len() / 2).map_or(limit_px, |m| 1.4826 * m).max(0.1)
+        lengths.sort_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
+        Noise(std::array::from_fn(|kind| {
+            let of_kind = lengths.partition_point(|l| l.0 < kind)..lengths.partition_point(|l| l.0 <= kind);
+            let of_kind = &lengths[of_kind];
+            // 1.4826 makes the median absolute deviation the standard deviation of normal errors.
+            of_kind.get(of_kind.len() / 2).map_or(limit_px, |l| 1.4826 * l.1).max(0.1)
+        }))
     }
 
-    fn equations(&self, observed: &Observed, limit_px: f64, noise_px: f64) -> Equations {
-        let information = 1.0 / (CORRELATION * noise_px).powi(2);
+    fn equations(&self, observed: &Observed, limit_px: f64, noise: &Noise) -> Equations {
         let frames: Vec<FrameEquations> = self
             .frames
             .par_iter()
             .zip(&observed.observations)
             .map(|(frame, list)| {
                 let mut e = FrameEquations {
-                    mixed: Matrix6::zeros(),
+                    mixed: SMatrix::zeros(),
                     own: self.prior_information(),
-                    object: Matrix6::zeros(),
+                    object: ObjectMatrix::zeros(),
                     right: self.prior_information() * -self.drift_twist(frame),
-                    object_right: Vector6::zeros(),
+                    object_right: ObjectVector::zeros(),
                 };
                 let projection = self.projection(frame, observed.level);
-                for Residual { px: r, by_object, by_drift } in list.iter().filter_map(|o| projection.residual(o)) {
+                for o in list {
+                    let Some(Residual { px: r, by_object, by_drift }) = projection.residual(o) else { continue };
+                    let (information, limit_px) = noise.of(o, limit_px);
                     let weight = tukey(r, limit_px) * information;
                     if weight > 0.0 {
                         e.object += by_object.transpose() * by_object * weight;
@@ -218,14 +326,35 @@ impl ContourFit<'_> {
                 e
             })
             .collect();
-        let object = frames.iter().map(|f| f.object).sum();
-        let object_right = frames.iter().map(|f| f.object_right).sum();
+        let mut object: ObjectMatrix = frames.iter().map(|f| f.object).sum();
+        let mut object_right: ObjectVector = frames.iter().map(|f| f.object_right).sum();
+        let scale_information = self.scale_information.min(EXACT);
+        object[(6, 6)] += scale_information;
+        object_right[6] -= scale_information * self.log_scale;
         Equations { object, object_right, frames }
+    }
+
+    /// What the edges and the phone's poses together say of the object's size: the logarithm of its ratio to the model's,
+    /// and its standard deviation. The drifts have taken up a wrong size by moving all cameras towards the object or away;
+    /// freeing it as well shows how much of that is common to them.
+    pub fn log_scale_found(&self, observed: &Observed, limit_px: f64) -> Option<(f64, f64)> {
+        let mut equations = self.equations(observed, limit_px, &self.noise_px(observed, limit_px));
+        let scale_information = self.scale_information.min(EXACT);
+        equations.object[(6, 6)] -= scale_information;
+        equations.object_right[6] += scale_information * self.log_scale;
+        let mut right = DVector::zeros(OBJECT + 6 * self.frames.len());
+        right.rows_mut(0, OBJECT).copy_from(&equations.object_right);
+        for (i, f) in equations.frames.iter().enumerate() {
+            right.rows_mut(OBJECT + 6 * i, 6).copy_from(&f.right);
+        }
+        let cholesky = equations.dense().cholesky()?;
+        let unit = DVector::from_fn(right.len(), |i, _| f64::from(u8::from(i == 6)));
+        Some((self.log_scale + cholesky.solve(&right)[6], cholesky.solve(&unit)[6].sqrt()))
     }
 
     /// What the edges say of each frame's drift with the object held, without the prior.
     pub fn frame_terms(&self, observed: &Observed, limit_px: f64) -> Vec<CameraTerm> {
-        let equations = self.equations(observed, limit_px, self.noise_px(observed, limit_px));
+        let equations = self.equations(observed, limit_px, &self.noise_px(observed, limit_px));
         let prior = self.prior_information();
         self.frames
             .iter()
@@ -247,34 +376,30 @@ impl ContourFit<'_> {
         twist_about(&frame.drift, &self.center())
     }
 
-    /// Share of the model's visible edges that the photographs show where they should be, and the share that would be
-    /// found by chance, with the model shifted in the image.
-    pub fn agreement(&self, level: usize, limit_px: f64) -> (f64, f64) {
+    /// Per frame: share of the model's visible edges that the photograph shows where they should be, and the share that
+    /// would be found by chance, with the model shifted in the image.
+    pub fn agreement(&self, level: usize, limit_px: f64) -> Vec<Agreement> {
         const SHIFTS_PX: [(f64, f64); 4] = [(7.3, 5.1), (-5.7, 6.9), (-6.3, -7.7), (8.1, -4.9)];
         let range = (limit_px.ceil() as usize + 1).min(MAX_RANGE_PX);
-        let sums: Vec<(f64, f64, f64)> = self
-            .frames
+        self.frames
             .par_iter()
             .map(|frame| {
                 let view = view_at(&frame.intrinsics, frame.size, &self.cam_from_object(frame), level);
                 let image = frame.pyramid.level(level);
-                let hit = |pixel: Point2<f64>, normal: &Vector2<f64>| {
-                    let found = candidates(image, &pixel, normal, range);
+                let hit = |pixel: Point2<f64>, v: &VisibleSample| {
+                    let found = candidates(image, &pixel, &v.normal, range, v.kind);
                     found.as_slice().iter().map(|r| tukey(*r, limit_px)).fold(0.0, f64::max)
                 };
                 let visible = self.edges.visible_samples(&view, self.samples);
-                let mut sums = (0.0, 0.0, visible.len() as f64);
+                let mut sum = Agreement { found: 0.0, by_chance: 0.0, samples: visible.len() as f64 };
                 for v in &visible {
-                    sums.0 += hit(v.pixel, &v.normal);
-                    let by_chance: f64 =
-                        SHIFTS_PX.iter().map(|(x, y)| hit(v.pixel + Vector2::new(*x, *y), &v.normal)).sum();
-                    sums.1 += by_chance / SHIFTS_PX.len() as f64;
+                    sum.found += hit(v.pixel, v);
+                    let by_chance: f64 = SHIFTS_PX.iter().map(|(x, y)| hit(v.pixel + Vector2::new(*x, *y), v)).sum();
+                    sum.by_chance += by_chance / SHIFTS_PX.len() as f64;
                 }
-                sums
+                sum
             })
-            .collect();
-        let total = sums.iter().fold((0.0, 0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1, a.2 + b.2));
-        if total.2 > 0.0 { (total.0 / total.2, total.1 / total.2) } else { (0.0, 0.0) }
+            .collect()
     }
 
     /// Per frame: share of samples within `limit_px`, and their root mean square residual in pixels of the photograph.
@@ -315,38 +440,38 @@ impl ContourFit<'_> {
     /// The inverse of the normal equations around the sandwich of scores summed over each edge in each frame (the
     /// cluster-robust covariance of White 1980 and Liang and Zeger 1986): samples of one edge err together.
     pub fn uncertainty(&self, observed: &Observed, limit_px: f64) -> Option<Uncertainty> {
-        let noise_px = self.noise_px(observed, limit_px);
-        let equations = self.equations(observed, limit_px, noise_px);
-        let n = 6 + 6 * self.frames.len();
+        let noise = self.noise_px(observed, limit_px);
+        let equations = self.equations(observed, limit_px, &noise);
+        let n = OBJECT + 6 * self.frames.len();
         let inverse = equations.dense().cholesky()?.inverse();
-        let information = 1.0 / (CORRELATION * noise_px).powi(2);
         let mut scores = DMatrix::zeros(n, n);
         for (i, (frame, list)) in self.frames.iter().zip(&observed.observations).enumerate() {
-            let at = 6 + 6 * i;
-            let mut add = |sum: &(Vector6<f64>, Vector6<f64>)| {
-                let mut g = DVector::zeros(12);
-                g.rows_mut(0, 6).copy_from(&sum.0);
-                g.rows_mut(6, 6).copy_from(&sum.1);
+            let at = OBJECT + 6 * i;
+            let mut add = |sum: &(ObjectVector, Vector6<f64>)| {
+                let mut g = DVector::zeros(OBJECT + 6);
+                g.rows_mut(0, OBJECT).copy_from(&sum.0);
+                g.rows_mut(OBJECT, 6).copy_from(&sum.1);
                 let outer = &g * g.transpose();
-                for (from_row, to_row) in [(0, 0), (6, at)] {
-                    for (from_col, to_col) in [(0, 0), (6, at)] {
-                        let mut block = scores.view_mut((to_row, to_col), (6, 6));
-                        block += outer.view((from_row, from_col), (6, 6));
+                for (from_row, to_row, rows) in [(0, 0, OBJECT), (OBJECT, at, 6)] {
+                    for (from_col, to_col, cols) in [(0, 0, OBJECT), (OBJECT, at, 6)] {
+                        let mut block = scores.view_mut((to_row, to_col), (rows, cols));
+                        block += outer.view((from_row, from_col), (rows, cols));
                     }
                 }
             };
             let projection = self.projection(frame, observed.level);
-            let mut rows: Vec<(u32, f64, RowVector6<f64>, RowVector6<f64>)> = list
+            let mut rows: Vec<(u32, f64, RowSVector<f64, OBJECT>, RowVector6<f64>)> = list
                 .iter()
                 .filter_map(|o| {
                     let Residual { px: r, by_object, by_drift } = projection.residual(o)?;
+                    let (information, limit_px) = noise.of(o, limit_px);
                     let weight = tukey(r, limit_px) * information;
                     (weight > 0.0).then_some((o.visible.sample.edge, r * weight, by_object, by_drift))
                 })
                 .collect();
             rows.sort_by_key(|row| row.0);
             for edge in rows.chunk_by(|a, b| a.0 == b.0) {
-                let mut sum = (Vector6::zeros(), Vector6::zeros());
+                let mut sum = (ObjectVector::zeros(), Vector6::zeros());
                 for (_, r, by_object, by_drift) in edge {
                     sum.0 += by_object.transpose() * *r;
                     sum.1 += by_drift.transpose() * *r;
@@ -359,10 +484,10 @@ impl ContourFit<'_> {
         let covariance = &inverse * scores * &inverse;
         let block = |row: usize, col: usize| -> Matrix6<f64> { covariance.fixed_view::<6, 6>(row, col).into_owned() };
         let object = block(0, 0);
-        let frames: Vec<Matrix6<f64>> = (0..self.frames.len()).map(|i| block(6 + 6 * i, 6 + 6 * i)).collect();
+        let frames: Vec<Matrix6<f64>> = (0..self.frames.len()).map(|i| block(OBJECT + 6 * i, OBJECT + 6 * i)).collect();
         let object_in_cam = (0..self.frames.len())
             .map(|i| {
-                let mixed = block(0, 6 + 6 * i);
+                let mixed = block(0, OBJECT + 6 * i);
                 object + frames[i] + mixed + mixed.transpose()
             })
             .collect();
@@ -372,7 +497,7 @@ impl ContourFit<'_> {
 
 impl Equations {
     /// The object's step and each frame's; the frames are eliminated first (Schur complement).
-    fn solve(&self) -> Option<(Vector6<f64>, Vec<Vector6<f64>>)> {
+    fn solve(&self) -> Option<(ObjectVector, Vec<Vector6<f64>>)> {
         let mut reduced = self.object;
         let mut right = self.object_right;
         let mut inverses = Vec::with_capacity(self.frames.len());
@@ -383,7 +508,7 @@ impl Equations {
             inverses.push(inverse);
         }
         // What no edge determines does not move.
-        reduced += Matrix6::from_diagonal(&(self.object.diagonal() * 1e-9));
+        reduced += ObjectMatrix::from_diagonal(&(self.object.diagonal() * 1e-9));
         let object = reduced.cholesky()?.solve(&right);
         let frames =
             self.frames.iter().zip(&inverses).map(|(f, i)| i * (f.right - f.mixed.transpose() * object)).collect();
@@ -391,13 +516,13 @@ impl Equations {
     }
 
     fn dense(&self) -> DMatrix<f64> {
-        let n = 6 + 6 * self.frames.len();
+        let n = OBJECT + 6 * self.frames.len();
         let mut dense = DMatrix::zeros(n, n);
-        dense.view_mut((0, 0), (6, 6)).copy_from(&self.object);
+        dense.view_mut((0, 0), (OBJECT, OBJECT)).copy_from(&self.object);
         for (i, f) in self.frames.iter().enumerate() {
-            let at = 6 + 6 * i;
-            dense.view_mut((0, at), (6, 6)).copy_from(&f.mixed);
-            dense.view_mut((at, 0), (6, 6)).copy_from(&f.mixed.transpose());
+            let at = OBJECT + 6 * i;
+            dense.view_mut((0, at), (OBJECT, 6)).copy_from(&f.mixed);
+            dense.view_mut((at, 0), (6, OBJECT)).copy_from(&f.mixed.transpose());
             dense.view_mut((at, at), (6, 6)).copy_from(&f.own);
         }
         dense

@@ -8,7 +8,8 @@ use mb_job::{Error, InputError, Progress, Result, Steps};
 use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
 
-use crate::output::{begin_stage, rows};
+use crate::model_scale::fitting_scale;
+use crate::output::{begin_stage, phone_frames, put_phone_cameras_back, rows};
 use crate::pnp::{Correspondence, PnpError, PnpOptions, PointLayout, PoseEstimate, PosedCamera, estimate_pose};
 
 /// How `align_keypoints` works.
@@ -86,7 +87,7 @@ pub struct KeypointResidual {
 
 /// Computes the object's pose from `annotation/keypoints.json` and writes `alignment/alignment.json`.
 ///
-/// The cameras' poses are taken from `pose/`, as exact where the clicks of all frames agree to within their noise, and
+/// The cameras' poses are the phone's (refined ones of an earlier bundle adjustment are taken back), as exact where the clicks of all frames agree to within their noise, and
 /// else as drifted by about [`PnpOptions::drift_mm`] each. Wrong clicks are left out and named in
 /// the warnings. Results of later stages that an earlier run left behind in `alignment/` are removed.
 ///
@@ -111,9 +112,10 @@ pub fn align_keypoints(
     let mut ids: Vec<FrameId> = keypoints.keypoints.iter().map(|k| k.frame).collect();
     ids.sort_unstable();
     ids.dedup();
-    let cameras: Vec<PosedCamera> = ids
+    let phone = phone_frames(sequence)?;
+    let cameras: Vec<PosedCamera> = phone
         .iter()
-        .filter_map(|id| sequence.frame(*id))
+        .filter(|f| ids.binary_search(&f.id).is_ok())
         .map(|f| PosedCamera { intrinsics: f.intrinsics, world_from_cam: f.world_from_cam })
         .collect();
     let correspondences: Vec<Correspondence> = keypoints
@@ -125,9 +127,24 @@ pub fn align_keypoints(
             point_in_object: k.point_in_object_m,
         })
         .collect();
-    let (estimate, drifted) = estimate(&cameras, &correspondences, &options.pnp).map_err(|e| explain(&path, &e))?;
+    let found = estimate(&cameras, &correspondences, &options.pnp);
+    // Clicks that agree with exact cameras also agree about the size; other failures are about how the points lie.
+    let size_matters = match &found {
+        Ok((_, drifted)) => *drifted,
+        Err(e) => matches!(e, PnpError::NoAgreement { .. } | PnpError::Behind { .. }),
+    };
+    let size = size_matters.then(|| wrong_size(&cameras, &correspondences, &options.pnp)).flatten();
+    let beyond_drift = size.filter(|factor| found.is_err() || factor.max(1.0 / factor) > BEYOND_DRIFT);
+    if let Some(factor) = beyond_drift {
+        let found = format!("the clicks fit a model {factor:.3} times as large as point_in_object_m says");
+        return Err(InputError::new(path, found)
+            .help("Lengths are metres in point_in_object_m, model/mesh.ply and pose/: 1 LDraw unit is 0.0004 m")
+            .into());
+    }
+    let (estimate, drifted) = found.map_err(|e| explain(&path, &e))?;
 
     let written = begin_stage(sequence)?;
+    put_phone_cameras_back(sequence, &phone)?;
     Alignment {
         version: 1,
         stage: AlignmentStage::Keypoints,
@@ -138,7 +155,13 @@ pub fn align_keypoints(
     }
     .write(&written)?;
     steps.step()?;
-    Ok(summary(&keypoints, &estimate, ids.len(), drifted, written))
+    let mut summary = summary(&keypoints, &estimate, ids.len(), drifted, written);
+    if let Some(factor) = size {
+        summary.warnings.push(format!(
+            "the clicks agree better with a model {factor:.3} times as large: check the units of the model and of the phone's poses"
+        ));
+    }
+    Ok(summary)
 }
 
 /// The pose with the cameras' relative poses taken as exact where the clicks bear that out, else as drifted; and which.
@@ -191,6 +214,20 @@ fn check(path: &Path, keypoints: &Keypoints, sequence: &Sequence) -> Result<()> 
         }
     }
     Ok(())
+}
+
+/// A size that differs by more than this factor is no matter of drifting poses.
+const BEYOND_DRIFT: f64 = 1.1;
+
+/// What the model's lengths must be multiplied by, where the clicks say clearly that its size is wrong.
+fn wrong_size(cameras: &[PosedCamera], correspondences: &[Correspondence], options: &PnpOptions) -> Option<f64> {
+    /// Half the clicks lie this much closer, and the size differs by more than drifting poses feign.
+    const CLEARLY: f64 = 0.5;
+    const LEAST: f64 = 1.04;
+    let fit = fitting_scale(cameras, correspondences)?;
+    // The best of many sizes always fits a little better than the model's own; drift adds several pixels to both.
+    let fits = fit.median_px < CLEARLY * fit.own_median_px && fit.own_median_px > 2.0 * options.click_noise_px;
+    (fits && fit.factor.max(1.0 / fit.factor) > LEAST).then_some(fit.factor)
 }
 
 /// A pose failure as bad input, with what to do.

@@ -21,6 +21,8 @@ mod features;
 mod keypoints;
 mod matching;
 mod model_edges;
+mod model_scale;
+mod outcome;
 mod output;
 mod pnp;
 mod pnp_problem;
@@ -30,6 +32,7 @@ mod scale_space;
 mod sqpnp;
 mod tracks;
 
+pub use adjust::{AdjustedCamera, AdjustedPoint, Adjustment, CameraTerm, PointObservation};
 pub use board::{
     BoardFrame, BoardOptions, BoardOutcome, BoardSummary, CalibratedPhoto, CalibrationSummary, PhotoCalibration,
     align_board, calibrate_photos,
@@ -38,6 +41,7 @@ pub use bundle::{BundleOptions, BundleSummary, BundledFrame, Dropped, align_bund
 pub use features::{Feature, FeatureOptions, detect_features};
 pub use keypoints::{KeypointOptions, KeypointResidual, KeypointSummary, align_keypoints};
 pub use matching::{MatchOptions, match_features};
+pub use outcome::FrameOutcome;
 pub use pnp::{Correspondence, PnpError, PnpOptions, PointLayout, PoseEstimate, PosedCamera, estimate_pose};
 pub use refine::{RefineOptions, RefineSummary, RefinedFrame, align_refine};
 pub use sqpnp::{Sighting, Solution, solve as sqpnp};

@@ -22,12 +22,32 @@ pub(crate) struct EdgeSample {
     pub direction: Unit<Vector3<f64>>,
     /// Which edge; samples of one edge err together.
     pub edge: u32,
+    /// From the edge into each of its two faces, across it; zero where there are not two.
+    into_faces: [Vector3<f64>; 2],
+}
+
+/// What a view shows on the two sides of an edge.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum EdgeKind {
+    /// The model before what is behind it.
+    Silhouette,
+    /// A surface of the model before another one.
+    Contour,
+    /// Two parts that touch: a photograph shows the dark gap between them.
+    Seam,
+    /// Two faces of a part: a photograph may show a bright line where the edge is rounded.
+    Crease,
+}
+
+impl EdgeKind {
+    pub const COUNT: usize = 4;
 }
 
 /// An edge sample as a view shows it.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct VisibleSample {
     pub sample: EdgeSample,
+    pub kind: EdgeKind,
     pub pixel: Point2<f64>,
     /// Across the edge in the image, unit length.
     pub normal: Vector2<f64>,
@@ -39,6 +59,7 @@ pub(crate) struct ModelEdges {
     /// Unit normals of the triangles; zero where degenerate.
     normals: Vec<Vector3<f64>>,
     colors: Option<Vec<[u8; 3]>>,
+    parts: Option<Vec<u32>>,
     samples: Vec<EdgeSample>,
     pub centroid_in_object: Point3<f64>,
 }
@@ -63,25 +84,36 @@ impl ModelEdges {
             }
         }
         sides.sort_unstable();
-        let mut edges: Vec<(u32, u32)> = sides
+        let mut edges: Vec<(u32, u32, [u32; 2])> = sides
             .chunk_by(|a, b| (a.0, a.1, a.2) == (b.0, b.1, b.2))
             .filter(|faces| {
                 let first = &normals[faces[0].3 as usize];
                 faces.len() == 1 || faces[1..].iter().any(|f| normals[f.3 as usize].dot(first).abs() < FLAT_RAD.cos())
             })
-            .map(|faces| (faces[0].1, faces[0].2))
+            .map(|faces| {
+                let two = if faces.len() == 2 { [faces[0].3, faces[1].3] } else { [NO_TRIANGLE; 2] };
+                (faces[0].1, faces[0].2, two)
+            })
             .collect();
         edges.shuffle(&mut rng(seed, 0));
         let mut lots = rng(seed, 2);
         let mut samples = Vec::new();
-        for (edge, &(a, b)) in edges.iter().enumerate() {
+        for (edge, &(a, b, faces)) in edges.iter().enumerate() {
             let (a, b) = (mesh.vertices[a as usize], mesh.vertices[b as usize]);
             let Some(direction) = Unit::try_new(b - a, 1e-9) else { continue };
+            let into_faces = faces.map(|t| {
+                let Some(corners) = mesh.triangles.get(t as usize) else { return Vector3::zeros() };
+                // From the edge to the face's middle, less the part along the edge.
+                let middle = corners.iter().map(|v| mesh.vertices[*v as usize].coords).sum::<Vector3<f64>>() / 3.0;
+                let to_middle = middle - a.coords;
+                to_middle - *direction * direction.dot(&to_middle)
+            });
             // Short edges are drawn by lot, so that finely modelled parts have no more samples than their length's worth.
             let count = ((b - a).norm() / SPACING_M + lots.random::<f64>()).floor().min(1000.0) as usize;
             for i in 0..count {
                 let along = (i as f64 + 0.5) / count as f64;
-                samples.push(EdgeSample { point_in_object: a + (b - a) * along, direction, edge: edge as u32 });
+                let point_in_object = a + (b - a) * along;
+                samples.push(EdgeSample { point_in_object, direction, edge: edge as u32, into_faces });
             }
         }
         samples.shuffle(&mut rng(seed, 1));
@@ -89,6 +121,7 @@ impl ModelEdges {
             scene: Scene::new(mesh),
             normals,
             colors: mesh.triangle_colors.clone(),
+            parts: mesh.triangle_parts.clone(),
             samples,
             centroid_in_object: mesh.bounds().center(),
         }
@@ -108,50 +141,115 @@ impl ModelEdges {
         self.samples.truncate(MAX_SAMPLES);
     }
 
-    /// Up to `limit` samples that the view shows as an edge.
+    /// Up to `limit` samples that the view shows as an edge; first those with no other edge of the model beside them, whose
+    /// images nothing pulls to one side.
     pub fn visible_samples(&self, view: &View<Object>, limit: usize) -> Vec<VisibleSample> {
         let raster = self.scene.render(view);
-        self.samples.iter().filter_map(|s| self.visible(s, view, &raster)).take(limit).collect()
+        let (mut alone, mut crowded) = (Vec::new(), Vec::new());
+        for visible in self.samples.iter().filter_map(|s| self.visible(s, view, &raster)) {
+            if self.is_alone(&visible, view, &raster) {
+                alone.push(visible);
+            } else {
+                crowded.push(visible);
+            }
+            if alone.len() == limit || alone.len() + crowded.len() == LOOKED_AT * limit {
+                break;
+            }
+        }
+        // Where nearly everything is crowded (small or far models, coarse pictures) crowded ones are better than none.
+        let wanted = (limit / 2).saturating_sub(alone.len()).min(crowded.len());
+        alone.extend_from_slice(&crowded[..wanted]);
+        alone
     }
 
     fn visible(&self, sample: &EdgeSample, view: &View<Object>, raster: &Raster) -> Option<VisibleSample> {
-        /// Distance from the edge at which its two sides are looked at, pixels.
-        const ASIDE_PX: f64 = 1.6;
-        /// Steps in depth below this are no contour, metres.
-        const STEP_M: f64 = 5e-4;
         let p = view.cam_from_frame * sample.point_in_object;
         let pixel = view.intrinsics.img_from_cam(&p)?;
-        let margin = 4.0;
+        let margin = BESIDE_PX + 1.0;
         let inside = |v: f64, count: usize| v >= margin && v <= count as f64 - 1.0 - margin;
         if !inside(pixel.x, view.size.width) || !inside(pixel.y, view.size.height) {
             return None;
         }
         let normal = image_normal(&view.intrinsics, &view.cam_from_frame, sample, &p)?;
-        let side = |sign: f64| {
-            let q = pixel + normal * (sign * ASIDE_PX);
-            let at = (q.x.round() as usize, q.y.round() as usize);
-            (Point2::new(at.0 as f64, at.1 as f64), f64::from(raster.depth[at]), raster.triangle[at])
-        };
-        let sides = [side(1.0), side(-1.0)];
+        let sides = [ASIDE_PX, -ASIDE_PX].map(|by| Look::new(raster, &(pixel + normal * by)));
         // One pixel of depth at this distance, as wide as the two looks are apart, on a steep face.
         let tolerance = 8.0 * p.z / view.intrinsics.fx + 1e-4;
-        let shows = |&(_, z, t): &(Point2<f64>, f64, u32)| t != NO_TRIANGLE && (z - p.z).abs() < tolerance;
-        let covers = |&(_, z, t): &(Point2<f64>, f64, u32)| t != NO_TRIANGLE && z < p.z - tolerance;
+        let shows = |look: &Look| look.triangle != NO_TRIANGLE && (look.z - p.z).abs() < tolerance;
+        let covers = |look: &Look| look.triangle != NO_TRIANGLE && look.z < p.z - tolerance;
         if sides.iter().any(covers) || !sides.iter().any(shows) {
             return None;
         }
-        let [(q_a, z_a, t_a), (q_b, z_b, t_b)] = sides;
-        let is_edge = if t_a == NO_TRIANGLE || t_b == NO_TRIANGLE {
-            true
+        let kind = self.edge_between(&sides[0], &sides[1], view)?;
+        if matches!(kind, EdgeKind::Silhouette | EdgeKind::Contour) {
+            // The outline of a round part lies where its facets turn away; other edges of facets are a pixel beside it.
+            let faces = sample.into_faces.map(|into| {
+                let into = view.cam_from_frame.rotate(&into);
+                let k = &view.intrinsics;
+                normal.dot(&Vector2::new(k.fx * (into.x * p.z - into.z * p.x), k.fy * (into.y * p.z - into.z * p.y)))
+            });
+            if faces[0] * faces[1] < 0.0 {
+                return None;
+            }
+        }
+        Some(VisibleSample { sample: *sample, kind, pixel, normal })
+    }
+
+    /// Whether no other edge crosses the line across the sample's within [`BESIDE_PX`].
+    fn is_alone(&self, visible: &VisibleSample, view: &View<Object>, raster: &Raster) -> bool {
+        [1.0, -1.0].into_iter().all(|sign| {
+            let looks = [ASIDE_PX, 0.5 * (ASIDE_PX + BESIDE_PX), BESIDE_PX]
+                .map(|by| Look::new(raster, &(visible.pixel + visible.normal * (sign * by))));
+            looks.windows(2).all(|pair| self.edge_between(&pair[0], &pair[1], view).is_none())
+        })
+    }
+
+    /// What a photograph may show between two pixels.
+    fn edge_between(&self, a: &Look, b: &Look, view: &View<Object>) -> Option<EdgeKind> {
+        /// Steps in depth below this are no contour, metres.
+        const STEP_M: f64 = 5e-4;
+        if a.triangle == b.triangle {
+            return None;
+        }
+        if a.triangle == NO_TRIANGLE || b.triangle == NO_TRIANGLE {
+            return Some(EdgeKind::Silhouette);
+        }
+        let (t_a, t_b) = (a.triangle as usize, b.triangle as usize);
+        let (n_a, n_b) = (self.normals[t_a], self.normals[t_b]);
+        let way = view.intrinsics.cam_from_img(&a.pixel, a.z) - view.intrinsics.cam_from_img(&b.pixel, b.z);
+        let step = view.cam_from_frame.rotate(&n_b).dot(&way).abs();
+        let recolored = || self.colors.as_ref().is_some_and(|c| c[t_a] != c[t_b]);
+        if step > STEP_M {
+            Some(EdgeKind::Contour)
+        } else if self.parts.as_ref().is_some_and(|parts| parts[t_a] != parts[t_b]) {
+            Some(EdgeKind::Seam)
+        } else if n_a.dot(&n_b).abs() < 0.9 || recolored() {
+            Some(EdgeKind::Crease)
         } else {
-            let (n_a, n_b) = (self.normals[t_a as usize], self.normals[t_b as usize]);
-            let a = view.intrinsics.cam_from_img(&q_a, z_a);
-            let b = view.intrinsics.cam_from_img(&q_b, z_b);
-            let step = view.cam_from_frame.rotate(&n_b).dot(&(a - b)).abs();
-            let recolored = self.colors.as_ref().is_some_and(|c| c[t_a as usize] != c[t_b as usize]);
-            n_a.dot(&n_b).abs() < 0.9 || step > STEP_M || recolored
-        };
-        is_edge.then_some(VisibleSample { sample: *sample, pixel, normal })
+            None
+        }
+    }
+}
+
+/// Distance from an edge at which its two sides are looked at, pixels.
+const ASIDE_PX: f64 = 1.6;
+/// Distance from an edge within which another one would pull its image, pixels: the reach of a photograph's blur and
+/// sharpening.
+const BESIDE_PX: f64 = 4.0;
+/// How many times more samples are looked at than wanted, in search of those that stand alone.
+const LOOKED_AT: usize = 4;
+
+/// What a rendering has at a pixel.
+struct Look {
+    pixel: Point2<f64>,
+    z: f64,
+    triangle: u32,
+}
+
+impl Look {
+    fn new(raster: &Raster, at: &Point2<f64>) -> Self {
+        let (x, y) = (at.x.round() as usize, at.y.round() as usize);
+        let pixel = Point2::new(x as f64, y as f64);
+        Self { pixel, z: f64::from(raster.depth[(x, y)]), triangle: raster.triangle[(x, y)] }
     }
 }
 

@@ -10,9 +10,12 @@ use mb_mesh::read_mesh;
 use nalgebra::{Matrix6, Point2, Vector6};
 use serde::{Deserialize, Serialize};
 
-use crate::contour::{ContourFit, ContourFrame, DriftPrior, Observed, Uncertainty, motion_about, twist_about};
+use crate::FrameOutcome;
+use crate::contour::{
+    Agreement, ContourFit, ContourFrame, DriftPrior, Observed, Uncertainty, motion_about, twist_about,
+};
 use crate::model_edges::{ModelEdges, view_at};
-use crate::output::{OVERLAYS, begin_stage, rows};
+use crate::output::{OVERLAYS, begin_stage, phone_frames, put_phone_cameras_back, rows};
 use crate::pnp::about_origin;
 use crate::profile::Pyramid;
 
@@ -32,6 +35,9 @@ pub struct RefineOptions {
     pub least_confidence: f64,
     /// How many photographs are written with the model's edges drawn in.
     pub overlays: usize,
+    /// Whether the object's size is estimated too, as the phone measures it: a phone whose metres are not metres, or a
+    /// model in other units. The result then has the model's own size, and the cameras keep a matching distance.
+    pub scale: bool,
     /// Seed of the choice of samples.
     pub seed: u64,
 }
@@ -39,7 +45,16 @@ pub struct RefineOptions {
 impl Default for RefineOptions {
     fn default() -> Self {
         // A phone's relative poses err by 4.5 mm and 0.6 degrees (Li et al. 2023, table 5).
-        Self { frames: 24, samples: 800, drift_deg: 0.6, drift_mm: 4.5, least_confidence: 0.15, overlays: 6, seed: 0 }
+        Self {
+            frames: 24,
+            samples: 800,
+            drift_deg: 0.6,
+            drift_mm: 4.5,
+            least_confidence: 0.15,
+            overlays: 6,
+            scale: false,
+            seed: 0,
+        }
     }
 }
 
@@ -64,6 +79,10 @@ pub struct RefineSummary {
     pub expected_error_mm: f64,
     /// Expected error of its rotation as each camera sees it, degrees.
     pub expected_error_deg: f64,
+    /// Size of the object as the phone measures it over the model's: 1 where both are right.
+    pub scale: f64,
+    /// Its standard deviation, as far as drifts are independent.
+    pub scale_std: f64,
     /// Covariance of the object's pose in the world, left perturbation, `[rotation; translation]` (rad, m). Larger than
     /// the errors above: the world itself is only known as well as the phone's drift allows.
     pub covariance: [[f64; 6]; 6],
@@ -80,6 +99,8 @@ pub struct RefineSummary {
 pub struct RefinedFrame {
     /// Which frame.
     pub frame: FrameId,
+    /// What became of it.
+    pub outcome: FrameOutcome,
     /// Share of the model's visible edges found in it.
     pub agreement: f64,
     /// Root mean square distance to them, pixels.
@@ -107,7 +128,8 @@ const AGREES_PX: f64 = 2.0;
 pub fn align_refine(sequence: &Sequence, options: &RefineOptions, progress: &dyn Progress) -> Result<RefineSummary> {
     let start = sequence.read_alignment()?;
     let mesh = read_mesh(sequence.model_mesh_path())?;
-    let chosen = choose(sequence, options.frames)?;
+    let phone = phone_frames(sequence)?;
+    let chosen = choose(sequence, &phone, options.frames)?;
     let size = sequence.image_size();
     let coarsest = coarsest_level(size.width.min(size.height));
 
@@ -133,57 +155,53 @@ pub fn align_refine(sequence: &Sequence, options: &RefineOptions, progress: &dyn
         edges: &edges,
         frames,
         world_from_object: start.world_from_object,
+        log_scale: 0.0,
+        // A few per cent of play keep the first steps from running away.
+        scale_information: if options.scale { 0.1f64.powi(-2) } else { f64::INFINITY },
         prior: DriftPrior { rotation_rad: options.drift_deg.to_radians(), translation_m: options.drift_mm * 1e-3 },
         samples: options.samples,
     };
     coarse_to_fine(&mut fit, coarsest, &steps)?;
 
-    let (agreement, chance) = fit.agreement(0, AGREES_PX);
-    let confidence = ((agreement - chance) / (1.0 - chance).max(1e-9)).clamp(0.0, 1.0);
+    let agreements = fit.agreement(0, AGREES_PX);
+    let whole = Agreement::of_all(&agreements);
+    let (confidence, agreement) = (whole.confidence(), whole.share());
     let observed = fit.observe(0, 4);
-    let uncertainty = fit.uncertainty(&observed, AGREES_PX);
-    let Some(uncertainty) = uncertainty.filter(|_| confidence >= options.least_confidence) else {
+    let uncertainty = fit.uncertainty(&observed, AGREES_PX).zip(fit.log_scale_found(&observed, AGREES_PX));
+    let Some((uncertainty, (log_scale, scale_std))) = uncertainty.filter(|_| confidence >= options.least_confidence)
+    else {
         return Err(Error::Failed(format!(
             "the model's edges were not found in the photographs: {:.0} % agree, {:.0} % would by chance. Check that the \
-             model is the one photographed and that the keypoints are right; the earlier alignment was kept",
+             model is the one photographed, that its size is right (metres), and that the keypoints are right; the \
+             earlier alignment was kept",
             100.0 * agreement,
-            100.0 * chance
+            100.0 * whole.chance()
         )));
     };
     let written = begin_stage(sequence)?;
+    put_phone_cameras_back(sequence, &phone)?;
     let mut outputs = write_overlays(sequence, &chosen, &fit, &observed, options.overlays)?;
     let statistics = fit.frame_statistics(&observed, AGREES_PX);
-    let alignment = alignment(sequence, &chosen, &fit, &uncertainty, &statistics);
+    let outcomes: Vec<FrameOutcome> = agreements.iter().map(|a| outcome(a, &whole)).collect();
+    let drifts: Vec<Vector6<f64>> =
+        fit.frames.iter().map(|f| twist_about(&fit.drift_at_true_size(f), &fit.center())).collect();
+    let found = Found { chosen: &chosen, fit: &fit, drifts: &drifts, outcomes: &outcomes, statistics: &statistics };
+    let alignment = found.alignment(&phone, &uncertainty);
     alignment.write(&written)?;
     outputs.insert(0, written);
     steps.step()?;
 
-    let frames: Vec<RefinedFrame> = chosen
-        .iter()
-        .zip(&fit.frames)
-        .zip(&statistics)
-        .map(|((frame, state), (agreement, rms_px))| {
-            let twist = fit.drift_twist(state);
-            RefinedFrame {
-                frame: frame.id,
-                agreement: *agreement,
-                rms_px: *rms_px,
-                drift_mm: twist.fixed_rows::<3>(3).norm() * 1e3,
-                drift_deg: twist.fixed_rows::<3>(0).norm().to_degrees(),
-            }
-        })
-        .collect();
-    let mut warnings: Vec<String> = frames
-        .iter()
-        .filter(|f| f.agreement < 0.5 * agreement)
-        .map(|f| {
-            format!(
-                "frame {}: only {:.0} % of the model's edges were found (blurred, dark, or the object moved?)",
-                f.frame,
-                100.0 * f.agreement
-            )
-        })
-        .collect();
+    let frames = found.frames();
+    let mut warnings = found.warnings();
+    let scale = log_scale.exp();
+    if log_scale.abs() > LEAST_SCALE.max(4.0 * scale_std) {
+        let size = if log_scale > 0.0 { "larger" } else { "smaller" };
+        warnings.push(format!(
+            "the object is {:.1} % {size} than the model, as the phone measures it: check the units of the model and of the \
+             phone's poses",
+            100.0 * (scale - 1.0).abs()
+        ));
+    }
     let n = uncertainty.object_in_cam.len() as f64;
     let mean_trace =
         |at: usize| uncertainty.object_in_cam.iter().map(|c| c.fixed_view::<3, 3>(at, at).trace()).sum::<f64>() / n;
@@ -205,15 +223,137 @@ pub fn align_refine(sequence: &Sequence, options: &RefineOptions, progress: &dyn
         turned_deg: change.angle_rad().to_degrees(),
         rms_px: alignment.rms_px.unwrap_or(f64::NAN),
         agreement,
-        chance_agreement: chance,
+        chance_agreement: whole.chance(),
         confidence,
         expected_error_mm,
         expected_error_deg,
+        scale,
+        scale_std,
         covariance: alignment.object_covariance.unwrap_or_default(),
         frames,
         written: outputs,
         warnings,
     })
+}
+
+/// A size that differs by less is within what phones and bricks do.
+const LEAST_SCALE: f64 = 0.015;
+/// Drifts of neighbouring photographs that differ by more are no drift: a phone that finds its place again takes back a
+/// few millimetres (Li et al. 2023 have 4.5 mm over whole sequences).
+const JUMP_M: f64 = 0.012;
+const JUMP_RAD: f64 = 0.045;
+
+/// A frame that shows far fewer of the model's edges than all together do is of little use.
+fn outcome(frame: &Agreement, whole: &Agreement) -> FrameOutcome {
+    match frame.confidence() / whole.confidence() {
+        share if share < 0.25 => FrameOutcome::Unseen,
+        share if share < 0.6 => FrameOutcome::Weak,
+        _ => FrameOutcome::Solved,
+    }
+}
+
+/// Everything that was found of the photographs used.
+struct Found<'a> {
+    chosen: &'a [Frame],
+    fit: &'a ContourFit<'a>,
+    /// Twists about the object's middle, with the object at the model's size.
+    drifts: &'a [Vector6<f64>],
+    outcomes: &'a [FrameOutcome],
+    /// Share of edges found, and their root mean square distance in pixels.
+    statistics: &'a [(f64, f64)],
+}
+
+impl Found<'_> {
+    fn frames(&self) -> Vec<RefinedFrame> {
+        (0..self.chosen.len())
+            .map(|i| RefinedFrame {
+                frame: self.chosen[i].id,
+                outcome: self.outcomes[i],
+                agreement: self.statistics[i].0,
+                rms_px: self.statistics[i].1,
+                drift_mm: self.drifts[i].fixed_rows::<3>(3).norm() * 1e3,
+                drift_deg: self.drifts[i].fixed_rows::<3>(0).norm().to_degrees(),
+            })
+            .collect()
+    }
+
+    fn warnings(&self) -> Vec<String> {
+        let mut warnings = Vec::new();
+        for (frame, (outcome, (agreement, _))) in self.chosen.iter().zip(self.outcomes.iter().zip(self.statistics)) {
+            let share = 100.0 * agreement;
+            match outcome {
+                FrameOutcome::Solved => {}
+                FrameOutcome::Weak => warnings.push(format!(
+                    "frame {}: only {share:.0} % of the model's edges were found (blurred, dark, or the object moved?)",
+                    frame.id
+                )),
+                FrameOutcome::Unseen => warnings.push(format!(
+                    "frame {}: the model's edges were not found ({share:.0} %); its drift is taken from its neighbours",
+                    frame.id
+                )),
+            }
+        }
+        let solved: Vec<usize> = (0..self.chosen.len()).filter(|i| self.outcomes[*i] == FrameOutcome::Solved).collect();
+        for pair in solved.windows(2) {
+            let step = self.drifts[pair[1]] - self.drifts[pair[0]];
+            let (turn, shift) = (step.fixed_rows::<3>(0).norm(), step.fixed_rows::<3>(3).norm());
+            if shift > JUMP_M || turn > JUMP_RAD {
+                warnings.push(format!(
+                    "between frames {} and {} the object moved by {:.1} mm and {:.1} deg against the phone's poses: it was \
+                     pushed, or the phone lost its place",
+                    self.chosen[pair[0]].id,
+                    self.chosen[pair[1]].id,
+                    shift * 1e3,
+                    turn.to_degrees()
+                ));
+            }
+        }
+        warnings
+    }
+
+    /// The alignment of every frame: those that show the model with their own drift, the others with one between their
+    /// neighbours'.
+    fn alignment(&self, phone: &[Frame], uncertainty: &Uncertainty) -> Alignment {
+        let center = self.fit.center();
+        let seen: Vec<usize> = (0..self.chosen.len()).filter(|i| self.outcomes[*i] != FrameOutcome::Unseen).collect();
+        let id = |at: usize| self.chosen[seen[at]].id;
+        let position = |id: FrameId| phone.partition_point(|f| f.id < id) as f64;
+        let frames = phone
+            .iter()
+            .map(|frame| {
+                let next = seen.partition_point(|i| self.chosen[*i].id < frame.id);
+                let used = (next < seen.len() && id(next) == frame.id).then(|| seen[next]);
+                let twist = if let Some(i) = used {
+                    self.drifts[i]
+                } else if seen.is_empty() {
+                    Vector6::zeros()
+                } else if next == 0 || next == seen.len() {
+                    self.drifts[seen[next.min(seen.len() - 1)]]
+                } else {
+                    let (before, after) = (position(id(next - 1)), position(id(next)));
+                    let share = (position(frame.id) - before) / (after - before);
+                    self.drifts[seen[next - 1]] * (1.0 - share) + self.drifts[seen[next]] * share
+                };
+                FrameAlignment {
+                    frame: frame.id,
+                    world_from_cam: motion_about(&twist, &center).inverse() * frame.world_from_cam,
+                    covariance: used.map(|i| rows(&about_origin(&uncertainty.frames[i], &center))),
+                    rms_px: used.map(|i| self.statistics[i].1),
+                }
+            })
+            .collect();
+        let n = seen.len().max(1) as f64;
+        let mean_sq = seen.iter().map(|i| self.statistics[*i].1.powi(2)).sum::<f64>() / n;
+        let object: Matrix6<f64> = about_origin(&uncertainty.object, &center);
+        Alignment {
+            version: 1,
+            stage: AlignmentStage::Refine,
+            world_from_object: self.fit.world_from_object,
+            object_covariance: Some(rows(&object)),
+            rms_px: Some(mean_sq.sqrt()),
+            frames,
+        }
+    }
 }
 
 /// Passes over the pyramid, coarsest first: level below the coarsest, search range in its pixels, repetitions.
@@ -241,29 +381,34 @@ fn coarsest_pass(fit: &mut ContourFit, coarsest: usize) {
         }
     }
     let center = fit.center();
-    let mut best = (f64::NEG_INFINITY, start, Vec::new());
+    let mut best = (f64::NEG_INFINITY, start, 0.0, Vec::new());
     for twist in twists {
         fit.world_from_object = motion_about(&twist, &center) * start;
         fit.frames.iter_mut().for_each(|f| f.drift = Rigid3::identity());
+        fit.log_scale = 0.0;
         for (level, range_px, repetitions) in PASSES.into_iter().filter(|pass| pass.0 == coarsest) {
             pass(fit, level, range_px.max(10), repetitions);
         }
-        let (agreement, chance) = fit.agreement(coarsest.saturating_sub(1), AGREES_PX);
-        let confidence = (agreement - chance) / (1.0 - chance).max(1e-9);
+        let confidence = Agreement::of_all(&fit.agreement(coarsest.saturating_sub(1), AGREES_PX)).confidence();
         if confidence > best.0 {
-            best = (confidence, fit.world_from_object, fit.frames.iter().map(|f| f.drift).collect());
+            best = (confidence, fit.world_from_object, fit.log_scale, fit.frames.iter().map(|f| f.drift).collect());
         }
         if confidence >= GOOD_START {
             break;
         }
     }
-    fit.world_from_object = best.1;
-    fit.frames.iter_mut().zip(best.2).for_each(|(f, drift)| f.drift = drift);
+    (fit.world_from_object, fit.log_scale) = (best.1, best.2);
+    fit.frames.iter_mut().zip(best.3).for_each(|(f, drift)| f.drift = drift);
 }
 
 fn pass(fit: &mut ContourFit, level: usize, range_px: usize, repetitions: usize) {
+    let mut observed = fit.observe(level, range_px);
     for repetition in 0..repetitions {
-        let observed = fit.observe(level, range_px);
+        if repetition > 0 && repetition % 2 == 0 {
+            observed = fit.observe(level, range_px);
+        } else if repetition > 0 {
+            fit.observe_again(&mut observed, range_px);
+        }
         // Far edges count at first, near ones in the end.
         let share = 1.0 - repetition as f64 / repetitions as f64;
         let limit_px = (range_px as f64 * share).max(AGREES_PX);
@@ -285,60 +430,13 @@ fn coarse_to_fine(fit: &mut ContourFit, coarsest: usize, steps: &Steps) -> Resul
 }
 
 /// Frames with a photograph, spread evenly, posed as the phone has them.
-fn choose(sequence: &Sequence, count: usize) -> Result<Vec<Frame>> {
-    let with_image: Vec<&Frame> = sequence.frames().iter().filter(|f| f.image.is_some()).collect();
+fn choose(sequence: &Sequence, phone: &[Frame], count: usize) -> Result<Vec<Frame>> {
+    let with_image: Vec<&Frame> = phone.iter().filter(|f| f.image.is_some()).collect();
     if with_image.is_empty() {
         return Err(Error::input(sequence.root().join("image"), "no photographs to find the model's edges in"));
     }
     let count = count.clamp(1, with_image.len());
     Ok((0..count).map(|i| with_image[i * with_image.len() / count].clone()).collect())
-}
-
-/// The alignment of every frame: those used with their own drift, the others with one between their neighbours'.
-fn alignment(
-    sequence: &Sequence,
-    chosen: &[Frame],
-    fit: &ContourFit,
-    uncertainty: &Uncertainty,
-    statistics: &[(f64, f64)],
-) -> Alignment {
-    let center = fit.center();
-    let ids: Vec<FrameId> = chosen.iter().map(|f| f.id).collect();
-    let twists: Vec<Vector6<f64>> = fit.frames.iter().map(|f| twist_about(&f.drift, &center)).collect();
-    let position = |id: FrameId| sequence.frames().partition_point(|f| f.id < id) as f64;
-    let frames = sequence
-        .frames()
-        .iter()
-        .map(|frame| {
-            let next = ids.partition_point(|id| *id < frame.id);
-            let used = ids.get(next) == Some(&frame.id);
-            let twist = if next == 0 || used {
-                twists[next]
-            } else if next == ids.len() {
-                twists[next - 1]
-            } else {
-                let (before, after) = (position(ids[next - 1]), position(ids[next]));
-                let share = (position(frame.id) - before) / (after - before);
-                twists[next - 1] * (1.0 - share) + twists[next] * share
-            };
-            FrameAlignment {
-                frame: frame.id,
-                world_from_cam: motion_about(&twist, &center).inverse() * frame.world_from_cam,
-                covariance: used.then(|| rows(&about_origin(&uncertainty.frames[next], &center))),
-                rms_px: used.then(|| statistics[next].1),
-            }
-        })
-        .collect();
-    let mean_sq = statistics.iter().map(|(_, rms)| rms * rms).sum::<f64>() / statistics.len() as f64;
-    let object: Matrix6<f64> = about_origin(&uncertainty.object, &center);
-    Alignment {
-        version: 1,
-        stage: AlignmentStage::Refine,
-        world_from_object: fit.world_from_object,
-        object_covariance: Some(rows(&object)),
-        rms_px: Some(mean_sq.sqrt()),
-        frames,
-    }
 }
 
 /// Draws the model's edges into photographs: green where the photograph has them, red where not.

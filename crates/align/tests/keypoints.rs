@@ -119,6 +119,12 @@ fn bad_keypoints_are_explained_and_leave_nothing() {
         with(&|k| k.keypoints.iter_mut().for_each(|k| k.point_in_object_m = Point3::new(0.0, k.pixel.x * 1e-5, 0.0)));
     expect(line, &["one line"]);
 
+    // LDraw units taken for half a millimetre, and inches for centimetres.
+    for factor in [1.25, 1.0 / 2.54] {
+        let scaled = with(&|k| k.keypoints.iter_mut().for_each(|k| k.point_in_object_m *= factor));
+        expect(scaled, &["a model", "times as large", "metres"]);
+    }
+
     std::fs::remove_file(root.join(Keypoints::FILE)).unwrap();
     let Err(Error::Input(error)) = run(root) else { panic!("accepted") };
     assert!(error.to_string().contains("no clicked points"), "{error}");

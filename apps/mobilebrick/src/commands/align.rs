@@ -69,13 +69,22 @@ pub struct Refine {
     #[arg(long, value_name = "N", default_value_t = RefineOptions::default().frames)]
     frames: usize,
 
+    /// Estimate the object's size too, as the phone measures it
+    #[arg(long)]
+    scale: bool,
+
     #[command(flatten)]
     seed: Seed,
 }
 
 impl Refine {
     fn run(&self, terminal: &Terminal) -> Result<Outcome> {
-        let options = RefineOptions { frames: self.frames, seed: self.seed.seed, ..RefineOptions::default() };
+        let options = RefineOptions {
+            frames: self.frames,
+            scale: self.scale,
+            seed: self.seed.seed,
+            ..RefineOptions::default()
+        };
         let summary = mb_align::align_refine(&self.sequence.open()?, &options, terminal)?;
         let text = format!(
             "moved {:.2} mm and {:.3} deg; {:.0} % of the visible edges found, {:.2} px rms; confidence {:.2}, \
@@ -110,6 +119,10 @@ pub struct Bundle {
     #[arg(long)]
     no_relative_poses: bool,
 
+    /// Estimate each frame's focal length too; the phone's intrinsics are kept in intrinsic_arkit/
+    #[arg(long)]
+    focal: bool,
+
     #[command(flatten)]
     seed: Seed,
 }
@@ -120,6 +133,7 @@ impl Bundle {
             free_points: !self.no_free_points,
             contours: !self.no_contours,
             relative_poses: !self.no_relative_poses,
+            focal: self.focal,
             seed: self.seed.seed,
             ..BundleOptions::default()
         };
