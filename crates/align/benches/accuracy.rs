@@ -2,9 +2,10 @@
 //!
 //! `cargo bench -p mb-align --bench accuracy -- SEQUENCE...` aligns simulated captures from their clicks on. For each stage:
 //! the error of the object as the cameras see it (`object`: what all cameras have in common, in the object's frame, shift
-//! of its middle and turn; `frames`: root mean square over the cameras; `toward`: mean along the cameras' axes), the
-//! cameras in the object's frame (as `eval poses` has it), and the share of the model's pixels whose rendered depth is
-//! within 0.5 mm of the truth. `ABLATION=1` adds the bundle adjustment without each of its terms.
+//! of its middle and turn; `own`: root mean square over the cameras whose own photograph determines them; `frames`: over
+//! all; `toward`: mean along the cameras' axes), the cameras in the object's frame (as `eval poses` has it), and the share
+//! of the model's pixels whose rendered depth is within 0.5 mm of the truth. `ABLATION=1` adds the bundle adjustment
+//! without each of its terms.
 
 use std::path::Path;
 
@@ -19,8 +20,16 @@ use nalgebra::Vector3;
 
 fn main() {
     println!(
-        "{:<16} {:<15} {:>15} {:>15} {:>23} {:>15} {:>6} {:>6}  expected",
-        "sequence", "stage", "object mm deg", "frames mm deg", "toward x y z mm", "cameras mm deg", "depth%", "CPU s"
+        "{:<16} {:<15} {:>15} {:>15} {:>15} {:>23} {:>15} {:>6} {:>6}  expected",
+        "sequence",
+        "stage",
+        "object mm deg",
+        "own mm deg",
+        "frames mm deg",
+        "toward x y z mm",
+        "cameras mm deg",
+        "depth%",
+        "CPU s"
     );
     for folder in std::env::args().skip(1).filter(|a| !a.starts_with("--")) {
         measure(Path::new(&folder));
@@ -87,27 +96,33 @@ fn measure(folder: &Path) {
 
 fn report(folder: &Path, stage: &str, cpu_s: f64, expected: &str) {
     let sequence = Sequence::open(folder).expect("the capture can be read");
-    let found = sequence.read_alignment().expect("the stage wrote an alignment");
+    let alignment = sequence.read_alignment().expect("the stage wrote an alignment");
     let truth = Alignment::read(folder.join("simulation/alignment.json")).expect("the truth is known");
     let mesh = read_mesh(sequence.model_mesh_path()).expect("the model is there");
     let middle = mesh.bounds().center();
     let scene = Scene::new(&mesh);
 
-    let frames = sequence.aligned_frames(&found);
+    let frames = sequence.aligned_frames(&alignment);
     let n = frames.len() as f64;
-    let (mut shift, mut turn, mut shift_sq, mut turn_sq) = (Vector3::zeros(), Vector3::zeros(), 0.0, 0.0);
+    let (mut shift, mut turn) = (Vector3::zeros(), Vector3::zeros());
+    // Count, and sums of squares of shifts and turns: of frames that have a covariance, and of all.
+    let mut own = (0usize, 0.0, 0.0);
+    let mut whole = own;
     let (mut close, mut pixels) = (0usize, 0usize);
     let mut toward = Vector3::zeros();
     let (mut center_sq, mut angle) = (0.0, 0.0);
     for (i, (frame, right)) in frames.iter().zip(&truth.frames).enumerate() {
-        let found: Rigid3<Camera, Object> = frame.world_from_cam.inverse() * found.world_from_object;
+        let found: Rigid3<Camera, Object> = frame.world_from_cam.inverse() * alignment.world_from_object;
         let right: Rigid3<Camera, Object> = right.world_from_cam.inverse() * truth.world_from_object;
         // Where the object is found to stand, as a motion of the true one.
         let error = right.inverse() * found;
         let by = error * middle - middle;
         toward += right.rotate(&by) / n;
         (shift, turn) = (shift + by / n, turn + error.rotation().scaled_axis() / n);
-        (shift_sq, turn_sq) = (shift_sq + by.norm_squared() / n, turn_sq + error.angle_rad().powi(2) / n);
+        let has_own = alignment.frames.iter().any(|f| f.frame == frame.id && f.covariance.is_some());
+        for sums in [&mut whole].into_iter().chain(has_own.then_some(&mut own)) {
+            *sums = (sums.0 + 1, sums.1 + by.norm_squared(), sums.2 + error.angle_rad().powi(2));
+        }
         center_sq += (found.inverse().translation() - right.inverse().translation()).norm_squared() / n;
         angle += found.rotation().angle_to(&right.rotation()).to_degrees() / n;
         if i % 4 == 0 {
@@ -120,13 +135,17 @@ fn report(folder: &Path, stage: &str, cpu_s: f64, expected: &str) {
             }
         }
     }
+    let rms = |count: usize, sum_sq: f64| f64::sqrt(sum_sq / count as f64);
     println!(
-        "{:<16} {stage:<15} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>6.1} {cpu_s:>6.1}  {expected}",
+        "{:<16} {stage:<15} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>7.3} {:>6.1} \
+         {cpu_s:>6.1}  {expected}",
         sequence.name(),
         shift.norm() * 1e3,
         turn.norm().to_degrees(),
-        shift_sq.sqrt() * 1e3,
-        turn_sq.sqrt().to_degrees(),
+        rms(own.0, own.1) * 1e3,
+        rms(own.0, own.2).to_degrees(),
+        rms(whole.0, whole.1) * 1e3,
+        rms(whole.0, whole.2).to_degrees(),
         toward.x * 1e3,
         toward.y * 1e3,
         toward.z * 1e3,

@@ -18,7 +18,7 @@ use crate::contour::{ContourFit, ContourFrame, DriftPrior};
 use crate::features::{FeatureOptions, detect_features};
 use crate::model_edges::{ModelEdges, view_at};
 use crate::outcome::FrameOutcome;
-use crate::output::{BUNDLE, begin_stage, keep_phone_cameras, phone_frames, rows};
+use crate::output::{BUNDLE, begin_stage, keep_phone_cameras, keeps_phone_intrinsics, phone_frames, rows};
 use crate::pnp::about_origin;
 use crate::profile::Pyramid;
 use crate::tracks::{FeatureRef, TrackFrame, TrackOptions, find_tracks, triangulate};
@@ -517,12 +517,14 @@ fn write(
 ) -> Result<()> {
     let focal = adjustment.focal_information.is_finite();
     keep_phone_cameras(sequence, phone, focal)?;
+    // An earlier run may have left focal lengths of its own in `intrinsic/`.
+    let intrinsics = focal || keeps_phone_intrinsics(sequence);
     let ids = sequence.frames().iter().map(|f| f.id);
     let written = begin_stage(sequence)?;
     for (id, camera) in ids.clone().zip(&adjustment.cameras) {
         let name = format!("{id}.txt");
         write_pose_txt(sequence.root().join("pose").join(&name), &world_from_cam(camera))?;
-        if focal {
+        if intrinsics {
             write_intrinsics_txt(sequence.root().join("intrinsic").join(&name), &camera.adjusted_intrinsics())?;
         }
     }

@@ -69,6 +69,11 @@ pub(crate) fn keep_phone_cameras(sequence: &Sequence, phone: &[Frame], intrinsic
     Ok(())
 }
 
+/// Whether `intrinsic/` may hold other intrinsics than the phone's.
+pub(crate) fn keeps_phone_intrinsics(sequence: &Sequence) -> bool {
+    sequence.root().join(PHONE_INTRINSICS).is_dir()
+}
+
 /// Gives `pose/` and `intrinsic/` the phone's back, for a stage whose cameras are the phone's: refined ones of an earlier
 /// bundle adjustment would go with another pose of the object.
 pub(crate) fn put_phone_cameras_back(sequence: &Sequence, phone: &[Frame]) -> Result<()> {
