@@ -79,12 +79,8 @@ pub struct Refine {
 
 impl Refine {
     fn run(&self, terminal: &Terminal) -> Result<Outcome> {
-        let options = RefineOptions {
-            frames: self.frames,
-            scale: self.scale,
-            seed: self.seed.seed,
-            ..RefineOptions::default()
-        };
+        let options =
+            RefineOptions { frames: self.frames, scale: self.scale, seed: self.seed.seed, ..RefineOptions::default() };
         let summary = mb_align::align_refine(&self.sequence.open()?, &options, terminal)?;
         let text = format!(
             "moved {:.2} mm and {:.3} deg; {:.0} % of the visible edges found, {:.2} px rms; confidence {:.2}, \
