@@ -6,6 +6,7 @@
 
 mod board_study;
 mod capture_check;
+mod contact_sheet;
 mod demo;
 mod frame_pictures;
 mod leaderboard;
@@ -18,6 +19,7 @@ pub use board_study::{BoardStudy, BoardStudyOptions, StudiedPoses, StudiedSequen
 pub use capture_check::{
     CaptureCheck, CaptureCheckOptions, EpipolarCheck, EpipolarOptions, EpipolarPair, check_capture, check_report,
 };
+pub use contact_sheet::contact_sheet;
 pub use demo::{DemoOptions, DemoSummary, demo};
 pub use leaderboard::{LeaderboardOptions, LeaderboardSummary, leaderboard};
 pub use model_capture::{ModelCapture, simulate_model};

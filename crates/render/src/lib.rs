@@ -21,6 +21,7 @@
 
 mod cluster;
 mod line_art;
+mod outside;
 mod overlay;
 mod raster;
 mod ray_cast;
@@ -31,6 +32,7 @@ mod strip;
 mod view;
 
 pub use line_art::{LineArt, LineArtOptions, Look, SharpEdge, line_art};
+pub use outside::{OutsideSummary, outside_only};
 pub use overlay::overlay_edges;
 pub use raster::{NO_TRIANGLE, Raster};
 pub use ray_cast::ray_cast;
