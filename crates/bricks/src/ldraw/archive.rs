@@ -16,6 +16,7 @@ const MAX_ENTRY_BYTES: u64 = 128 << 20;
 const MAX_RATIO: u64 = 200;
 /// Small texts may pack well by chance.
 const RATIO_MATTERS_FROM_BYTES: u64 = 1 << 20;
+const DAMAGED: &str = "The archive is damaged: fetch or save it again";
 
 /// An open zip archive.
 pub(crate) struct Archive {
@@ -34,7 +35,8 @@ impl Archive {
         })?;
         let mut index_of_name = BTreeMap::new();
         for (index, name) in zip.file_names().enumerate() {
-            let name = name.map_err(|e| InputError::new(path, e.to_string()).at(format!("entry {index}")))?;
+            let name =
+                name.map_err(|e| InputError::new(path, e.to_string()).at(format!("entry {index}")).help(DAMAGED))?;
             let name = name.replace('\\', "/");
             if name.starts_with('/') || name.split('/').any(|piece| piece == "..") || name.contains(':') {
                 let shown: String = name.chars().take(80).collect();
@@ -56,14 +58,15 @@ impl Archive {
     /// `encrypted_help` says what to do where the entry is encrypted.
     pub fn read(&self, index: usize, encrypted_help: &str) -> Result<Vec<u8>> {
         let mut zip = self.zip.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let place = format!("entry {}", zip.file_names().nth(index).and_then(Result::ok).unwrap_or_default());
+        let name = zip.file_names().nth(index).and_then(Result::ok).unwrap_or_default();
+        let place = format!("entry {}", name.chars().take(80).collect::<String>());
         let bad = |found: &str| InputError::new(&self.path, found).at(place.clone());
         let entry = match zip.by_index(index) {
             Ok(entry) => entry,
             Err(ZipError::UnsupportedArchive(ZipError::PASSWORD_REQUIRED)) => {
                 return Err(bad("it is encrypted").help(encrypted_help).into());
             }
-            Err(e) => return Err(bad(&e.to_string()).into()),
+            Err(e) => return Err(bad(&format!("it cannot be read ({e})")).help(DAMAGED).into()),
         };
         let (declared, packed) = (entry.size(), entry.compressed_size());
         let bomb = |bytes: u64| bytes > RATIO_MATTERS_FROM_BYTES && bytes / packed.max(1) > MAX_RATIO;
@@ -77,9 +80,10 @@ impl Archive {
         let mut bytes = Vec::with_capacity(declared.min(RATIO_MATTERS_FROM_BYTES) as usize);
         // The declared size may lie.
         let limit = if declared > 0 { declared } else { MAX_ENTRY_BYTES };
-        entry.take(limit + 1).read_to_end(&mut bytes).map_err(|e| {
-            bad(&format!("it cannot be unpacked ({e})")).help("The archive is damaged: fetch or save it again")
-        })?;
+        entry
+            .take(limit + 1)
+            .read_to_end(&mut bytes)
+            .map_err(|e| bad(&format!("it cannot be unpacked ({e})")).help(DAMAGED))?;
         if bytes.len() as u64 > limit || bomb(bytes.len() as u64) {
             return Err(refuse(bytes.len() as u64).into());
         }
