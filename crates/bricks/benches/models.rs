@@ -2,7 +2,7 @@
 
 use cpu_time::ProcessTime;
 use mb_bricks::{
-    CheckOptions, MeshOptions, Model, PartLibrary, RandomOptions, demo_model, external_only, random_models,
+    BatchSummary, CheckOptions, MeshOptions, Model, PartLibrary, RandomOptions, demo_model, random_models,
 };
 use mb_job::Silent;
 
@@ -30,27 +30,24 @@ fn main() {
         let report = timed(&format!("{name}: check"), || model.check(&CheckOptions::default()));
         if let Ok(report) = report {
             println!(
-                "{name}: {} parts, {} covered, {} studs gripped, {} groups, {} collisions, stable: {}",
+                "{name}: {} parts, {} covered, {} studs gripped, {:?}, {} groups, {} collisions, stable: {}",
                 report.parts,
                 report.covered_parts,
                 report.connections,
+                report.joints,
                 report.groups,
                 report.collisions.len(),
                 report.stable
             );
         }
     }
-    let mesh = castle.mesh(&MeshOptions::default());
-    let (_, outside) = timed("built-in castle: outside only", || external_only(&mesh));
-    println!("built-in castle: {} of {} triangles are outside", outside.kept, outside.triangles);
     let batch = timed("135 random models", || random_models(&RandomOptions::default(), 135, &Silent));
     if let Ok(batch) = batch {
-        let parts: Vec<usize> = batch.iter().map(|random| random.summary.parts).collect();
-        println!("random models: {} to {} parts", parts.iter().min().unwrap_or(&0), parts.iter().max().unwrap_or(&0));
-        let options = RandomOptions { bricks: 150, ..RandomOptions::default() };
-        if let Ok(large) = mb_bricks::random_model(&options, 0) {
-            timed("random model of 150 bricks: check", || large.model.check(&CheckOptions::default()))
-                .expect("random models are complete");
-        }
+        println!("random models: {:#?}", BatchSummary::of(&batch));
+    }
+    let options = RandomOptions { bricks: 150, ..RandomOptions::default() };
+    if let Ok(large) = mb_bricks::random_model(&options, 0) {
+        timed("random model of 150 bricks: check", || large.model.check(&CheckOptions::default()))
+            .expect("random models are complete");
     }
 }

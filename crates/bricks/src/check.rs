@@ -1,22 +1,20 @@
 //! Can it be built, and does it stand?
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
-use mb_geometry::Aabb;
 use mb_job::{Error, Result};
-use nalgebra::{Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
+use crate::bodies::{GROUND_LDU, body_of};
 use crate::build_order::build_order;
 use crate::collisions::{Collision, collisions};
-use crate::connections::{Connection, Group, connections_with};
-use crate::flat::{METRES_PER_LDU, Shapes};
+use crate::connections::{Connection, connections_with};
+use crate::flat::Shapes;
+use crate::joints::joints;
+use crate::links::Links;
 use crate::model::Model;
 use crate::neighbors::Neighbors;
-use crate::statics::{Body, Equilibrium, equilibrium};
-
-/// A brick stands on the ground when it comes this close to the model's lowest point, LDraw units.
-const GROUND_LDU: f64 = 0.1;
+use crate::statics::{Body, Contact, Equilibrium, equilibrium};
 
 /// What bricks are like.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -47,20 +45,46 @@ pub struct WeakestConnection {
     pub load: f64,
 }
 
+/// How many joints of each kind a model has.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct JointCounts {
+    /// Bars in clips and hollow studs, fingers of hinges: round, about 3.2 mm across.
+    pub bars: usize,
+    /// Pins and axles in holes: round, about 4.8 mm across.
+    pub pins: usize,
+    /// Balls in sockets.
+    pub balls: usize,
+    /// Other round pegs in round holes: wheels, turntables, necks.
+    pub others: usize,
+}
+
+/// Parts about whose joints nothing is known.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct UncoveredPart {
+    /// The part's file name.
+    pub part: String,
+    /// What it is.
+    pub description: String,
+    /// How many of the model's bricks.
+    pub count: usize,
+}
+
 /// The document of `model check`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CheckReport {
     /// Bricks of the model.
     pub parts: usize,
-    /// Bricks with stud data or held by a stud; about the others nothing is known but their place.
+    /// Bricks with studs, with an underside for studs, or joined by a bar, pin, axle, hinge or ball.
     pub covered_parts: usize,
-    /// Whether all covered bricks hold together.
+    /// Whether all bricks hold together; those that are not covered count as held by what they touch.
     pub connected: bool,
-    /// Whether everything that holds to a brick on the ground is in equilibrium within the clutch force, and no
-    /// covered brick is left in the air.
+    /// Whether everything is in equilibrium within the clutch force and nothing hangs in the air.
     pub stable: bool,
-    /// Pairs of bricks in the same place.
+    /// Pairs of covered bricks in the same place. What a joint intends is none.
     pub collisions: Vec<Collision>,
+    /// Pairs in the same place that may be a joint that is not understood, or a collision: one brick is not covered, or
+    /// nothing else holds it.
+    pub unclear_overlaps: Vec<Collision>,
     /// Where it would break first; `null` where no stud is pulled or nothing balances.
     pub weakest: Option<WeakestConnection>,
     /// Indices of the bricks in an order in which each can be put in.
@@ -69,10 +93,18 @@ pub struct CheckReport {
     pub buildable: bool,
     /// Gripped studs.
     pub connections: usize,
+    /// Joints other than studs.
+    pub joints: JointCounts,
     /// How many groups of bricks hold together, single covered bricks included.
     pub groups: usize,
-    /// Covered bricks in groups that no brick on the ground carries.
+    /// Bricks that only lie on others, held by their weight.
+    pub resting_parts: Vec<usize>,
+    /// Bricks in groups that nothing carries.
     pub loose_parts: Vec<usize>,
+    /// Bricks of groups that stand on the ground but tip over or pull a stud off.
+    pub falling_parts: Vec<usize>,
+    /// Kinds of parts that are not covered.
+    pub uncovered: Vec<UncoveredPart>,
     /// What the figures leave out, and why it does not stand, for people.
     pub notes: Vec<String>,
 }
@@ -80,147 +112,225 @@ pub struct CheckReport {
 impl Model {
     /// Collisions, connections, equilibrium and a build order. Indices are those of [`Model::instances`].
     ///
+    /// Studs are judged by force. Joints (bars, pins, axles, hinges, balls) are taken to hold by friction: what they
+    /// join moves as one body. A brick about whose joints nothing is known counts as held by all that it touches, and
+    /// is reported as uncovered.
+    ///
     /// # Errors
     /// `Error::Input` for a model that lacks parts; `Error::Failed` where the solver finds no answer.
     pub fn check(&self, options: &CheckOptions) -> Result<CheckReport> {
         self.require_complete()?;
         let shapes = Shapes::of(self);
         let neighbors = Neighbors::of(self, &shapes);
-        let connections = connections_with(self, &shapes, &neighbors);
-        let collisions = collisions(self, &shapes, &neighbors);
         let ground = neighbors.boxes.iter().map(|b| b.max.y).fold(f64::NEG_INFINITY, f64::max);
-        let covered = |group: &&Group| group.bricks.iter().any(|&b| connections.covered[b]);
-        let groups = connections.groups();
-        let groups: Vec<&Group> = groups.iter().filter(covered).collect();
         let on_ground = |brick: usize| neighbors.boxes[brick].max.y > ground - GROUND_LDU;
-        let (standing, loose): (Vec<&Group>, Vec<&Group>) =
-            groups.iter().copied().partition(|group| group.bricks.iter().any(|&brick| on_ground(brick)));
-        let mut carried: Vec<usize> = standing.iter().flat_map(|group| group.bricks.iter().copied()).collect();
-        carried.sort_unstable();
-        let mut loose_parts: Vec<usize> = loose.iter().flat_map(|group| group.bricks.iter().copied()).collect();
-        loose_parts.sort_unstable();
-
-        let mut notes = vec![];
-        let covered_parts = connections.covered.iter().filter(|&&c| c).count();
+        let joints = joints(self, &neighbors);
+        let studs = connections_with(self, &shapes, &neighbors);
+        let overlaps = collisions(self, &shapes, &neighbors, &studs.studs, &joints.joints);
+        let links = Links::of(self, &shapes, &neighbors, studs, joints, &overlaps, on_ground);
+        let is_clear = |c: &Collision| links.covered[c.a] && links.covered[c.b] && !links.unclear.contains(&(c.a, c.b));
+        let (collisions, unclear_overlaps) = overlaps.into_iter().partition(is_clear);
+        let rigid = links.rigid_bodies();
+        let standing =
+            Standing { model: self, shapes: &shapes, neighbors: &neighbors, links: &links, rigid, ground, options };
+        let outcome = standing.judge(&on_ground)?;
+        let carried = |group: &&Vec<usize>| group.iter().any(|&brick| on_ground(brick));
+        let resting: BTreeSet<usize> = links.groups.iter().filter(|g| !carried(g)).flatten().copied().collect();
+        let resting_parts: Vec<usize> =
+            resting.into_iter().filter(|brick| outcome.loose.binary_search(brick).is_err()).collect();
+        let groups = links.groups.iter().filter(|group| group.iter().any(|&brick| links.covered[brick])).count();
+        let (build_order, buildable) = build_order(&neighbors.boxes, &links.studs.studs, ground - GROUND_LDU);
         let parts = self.instances().len();
+        let covered_parts = links.covered.iter().filter(|&&c| c).count();
+        let mut notes = outcome.notes;
         if covered_parts < parts {
             notes.push(format!(
-                "{} of {parts} parts have no studs and sit on none (hinges, clips, axles, figures): they are left out of \
-                 connections and equilibrium",
-                parts - covered_parts
+                "{} of {parts} parts have no known joint; {} contacts of theirs are taken to hold",
+                parts - covered_parts,
+                links.assumed.len()
             ));
         }
-        if !loose_parts.is_empty() {
-            notes.push(format!("{} parts hold to nothing that stands on the ground by studs", loose_parts.len()));
+        if !outcome.loose.is_empty() {
+            notes.push(format!("{} parts hang in the air: nothing joins or carries them", outcome.loose.len()));
         }
-        let bodies: Vec<Body> = carried
-            .iter()
-            .map(|&brick| self.body(brick, &shapes, &neighbors.boxes[brick], ground, options.density_kg_m3))
-            .collect();
-        let body_of_brick: BTreeMap<usize, usize> = carried.iter().enumerate().map(|(body, &b)| (b, body)).collect();
-        let of_bodies: Vec<Connection> = connections
-            .studs
-            .iter()
-            .filter_map(|c| {
-                let (stud_brick, grip_brick) = (*body_of_brick.get(&c.stud_brick)?, *body_of_brick.get(&c.grip_brick)?);
-                Some(Connection { stud_brick, grip_brick, ..*c })
-            })
-            .collect();
-        let (stands, weakest) = match equilibrium(&bodies, &of_bodies, options.clutch_n) {
-            Equilibrium::Balanced { load, load_of_stud } => {
-                if load > 1.0 {
-                    notes.push(format!("a stud would have to bear {load:.2} times its clutch force"));
-                }
-                (load <= 1.0, weakest(&of_bodies, &load_of_stud, &carried))
-            }
-            Equilibrium::Tips => {
-                notes.push("it tips over: no forces of studs and ground balance the weights".to_owned());
-                (false, None)
-            }
-            Equilibrium::Unknown => {
-                return Err(Error::Failed("the equilibrium of the model could not be computed".to_owned()));
-            }
-        };
-        let (build_order, buildable) = build_order(&neighbors.boxes, &connections.studs, ground - GROUND_LDU);
+        if !resting_parts.is_empty() {
+            notes.push(format!("{} parts only lie on others", resting_parts.len()));
+        }
         Ok(CheckReport {
             parts,
             covered_parts,
-            connected: groups.len() <= 1,
-            stable: stands && loose_parts.is_empty(),
+            connected: groups <= 1,
+            stable: outcome.falling.is_empty() && outcome.loose.is_empty(),
             collisions,
-            weakest,
+            unclear_overlaps,
+            weakest: outcome.weakest,
             build_order,
             buildable,
-            connections: connections.studs.len(),
-            groups: groups.len(),
-            loose_parts,
+            connections: links.studs.studs.len(),
+            joints: joint_counts(&links),
+            groups,
+            resting_parts,
+            loose_parts: outcome.loose,
+            falling_parts: outcome.falling,
+            uncovered: uncovered(self, &links),
             notes,
         })
     }
+}
 
-    fn body(&self, brick: usize, shapes: &Shapes, bounds: &Aabb, ground: f64, density_kg_m3: f64) -> Body {
-        let instance = &self.instances()[brick];
-        let shape = shapes.get(instance.part);
-        let corner = |v: u32| instance.ldraw_from_part.apply(&shape.vertices[v as usize]);
-        // Volume and centroid by the divergence theorem, about the middle of the box; nearly right for surfaces that
-        // are nearly closed.
-        let middle = bounds.center();
-        let (mut volume, mut moment) = (0.0, Vector3::zeros());
-        for triangle in &shape.triangles {
-            let [a, b, c] = triangle.map(|v| corner(v) - middle);
-            let piece = a.dot(&b.cross(&c)) / 6.0;
-            volume += piece;
-            moment += (a + b + c) * (piece / 4.0);
+fn joint_counts(links: &Links) -> JointCounts {
+    let mut counts = JointCounts::default();
+    for joint in &links.joints {
+        let count = match joint.radius {
+            _ if joint.axis_in_ldraw.norm() == 0.0 => &mut counts.balls,
+            r if (3.4..4.7).contains(&r) => &mut counts.bars,
+            r if (5.2..6.7).contains(&r) => &mut counts.pins,
+            _ => &mut counts.others,
+        };
+        *count += 1;
+    }
+    counts
+}
+
+/// The kinds of parts that are not covered, most frequent first.
+fn uncovered(model: &Model, links: &Links) -> Vec<UncoveredPart> {
+    let mut counts = BTreeMap::new();
+    for (brick, _) in model.instances().iter().zip(&links.covered).filter(|(_, covered)| !**covered) {
+        *counts.entry(brick.part).or_insert(0) += 1;
+    }
+    let mut kinds: Vec<UncoveredPart> = counts
+        .into_iter()
+        .map(|(part, count)| {
+            let file = model.file(part);
+            UncoveredPart { part: file.name.clone(), description: file.description.clone(), count }
+        })
+        .collect();
+    kinds.sort_by(|a, b| b.count.cmp(&a.count).then(a.part.cmp(&b.part)));
+    kinds
+}
+
+/// What equilibrium needs.
+struct Standing<'a> {
+    model: &'a Model,
+    shapes: &'a Shapes,
+    neighbors: &'a Neighbors,
+    links: &'a Links,
+    /// Bricks that move as one.
+    rigid: Vec<Vec<usize>>,
+    /// Height of the lowest feet, LDraw's y.
+    ground: f64,
+    options: &'a CheckOptions,
+}
+
+#[derive(Default)]
+struct Outcome {
+    /// Bricks of groups that nothing carries, ascending.
+    loose: Vec<usize>,
+    /// Bricks of piles that do not balance, ascending.
+    falling: Vec<usize>,
+    weakest: Option<WeakestConnection>,
+    notes: Vec<String>,
+}
+
+impl Standing<'_> {
+    /// Judges pile after pile: what stands on its own feet does not depend on its neighbours.
+    fn judge(&self, on_ground: &impl Fn(usize) -> bool) -> Result<Outcome> {
+        let mut outcome = Outcome::default();
+        for pile in self.links.piles() {
+            let bricks_of = |groups: &[usize]| -> BTreeSet<usize> {
+                groups.iter().flat_map(|&group| &self.links.groups[group]).copied().collect()
+            };
+            let bricks = bricks_of(&pile);
+            if !bricks.iter().any(|&brick| self.links.covered[brick]) {
+                // Of bricks whose joints are unknown nothing can be said.
+                continue;
+            }
+            if !bricks.iter().any(|&brick| on_ground(brick)) {
+                outcome.loose.extend(bricks);
+                continue;
+            }
+            if self.balances(&bricks, &mut outcome)? {
+                continue;
+            }
+            // Who is to blame: those that stand, each by itself, or those that lie on them.
+            let stands = |group: &usize| self.links.groups[*group].iter().any(|&brick| on_ground(brick));
+            let (standing, lying): (Vec<usize>, Vec<usize>) = pile.iter().partition(|group| stands(group));
+            let mut falling = BTreeSet::new();
+            for group in &standing {
+                let bricks = bricks_of(&[*group]);
+                if lying.is_empty() || !self.balances(&bricks, &mut outcome)? {
+                    falling.extend(bricks);
+                }
+            }
+            if falling.is_empty() {
+                falling = bricks_of(&lying);
+            }
+            let first = falling.first().map_or(0, |&brick| brick);
+            let name = &self.model.file(self.model.instances()[first].part).description;
+            outcome.notes.push(format!(
+                "{} parts ({}{}) do not keep their balance: they tip over or pull a stud off",
+                falling.len(),
+                name.trim(),
+                if falling.len() > 1 { " and others" } else { "" }
+            ));
+            outcome.falling.extend(falling);
         }
-        let box_volume = bounds.extent().product();
-        let plausible = (0.02..=1.0).contains(&(volume.abs() / box_volume));
-        let center = if plausible { middle + moment / volume } else { middle };
-        let center = if bounds.contains(&center) { center } else { middle };
-        // A quarter of its box is what a hollow brick fills.
-        let filled = if plausible { volume.abs() } else { 0.25 * box_volume };
-        let mass_kg = filled * METRES_PER_LDU.powi(3) * density_kg_m3;
-        let feet: Vec<Point3<f64>> = shape
-            .vertices
+        outcome.loose.sort_unstable();
+        outcome.falling.sort_unstable();
+        Ok(outcome)
+    }
+
+    /// Whether bricks that touch nothing else keep their balance within the clutch force.
+    fn balances(&self, bricks: &BTreeSet<usize>, outcome: &mut Outcome) -> Result<bool> {
+        let rigid: Vec<&Vec<usize>> = self.rigid.iter().filter(|body| bricks.contains(&body[0])).collect();
+        let mut body_of_brick = BTreeMap::new();
+        for (body, members) in rigid.iter().enumerate() {
+            body_of_brick.extend(members.iter().map(|&brick| (brick, body)));
+        }
+        let density = self.options.density_kg_m3;
+        let bodies: Vec<Body> = rigid
             .iter()
-            .map(|p| instance.ldraw_from_part.apply(p))
-            .filter(|p| p.y > ground - GROUND_LDU)
+            .map(|members| body_of(self.model, self.shapes, self.neighbors, members, self.ground, density))
             .collect();
-        Body { mass_kg, center, ground: convex_hull(feet) }
+        // The studs between different bodies, as they are in the model and as the programme wants them.
+        let all = self.links.studs.studs.iter();
+        let (of_model, of_bodies): (Vec<&Connection>, Vec<Connection>) = all
+            .filter_map(|c| {
+                let (stud, grip) = (*body_of_brick.get(&c.stud_brick)?, *body_of_brick.get(&c.grip_brick)?);
+                (stud != grip).then_some((c, Connection { stud_brick: stud, grip_brick: grip, ..*c }))
+            })
+            .unzip();
+        let rests = self.links.rests.iter();
+        let contacts: Vec<Contact> = rests
+            .filter_map(|rest| {
+                let (upper, lower) = (*body_of_brick.get(&rest.upper)?, *body_of_brick.get(&rest.lower)?);
+                (upper != lower).then(|| Contact { upper, lower, corners: rest.corners.clone() })
+            })
+            .collect();
+        match equilibrium(&bodies, &of_bodies, &contacts, self.options.clutch_n) {
+            Equilibrium::Balanced { load, load_of_stud } => {
+                let weakest = weakest(&of_model, &load_of_stud);
+                let known = outcome.weakest.as_ref().map_or(0.0, |known| known.load);
+                if weakest.as_ref().is_some_and(|found| found.load > known) {
+                    outcome.weakest = weakest;
+                }
+                Ok(load <= 1.0)
+            }
+            Equilibrium::Tips => Ok(false),
+            Equilibrium::Unknown => {
+                Err(Error::Failed(format!("the equilibrium of {} parts could not be computed", bricks.len())))
+            }
+        }
     }
 }
 
-fn weakest(connections: &[Connection], loads: &[f64], carried: &[usize]) -> Option<WeakestConnection> {
+fn weakest(connections: &[&Connection], loads: &[f64]) -> Option<WeakestConnection> {
     let (hardest, load) = connections.iter().zip(loads).max_by(|a, b| a.1.total_cmp(b.1))?;
-    let same = |c: &&Connection| (c.stud_brick, c.grip_brick) == (hardest.stud_brick, hardest.grip_brick);
+    let same = |c: &&&Connection| (c.stud_brick, c.grip_brick) == (hardest.stud_brick, hardest.grip_brick);
     (*load > 1e-6).then(|| WeakestConnection {
-        stud_brick: carried[hardest.stud_brick],
-        grip_brick: carried[hardest.grip_brick],
+        stud_brick: hardest.stud_brick,
+        grip_brick: hardest.grip_brick,
         studs: connections.iter().filter(same).count(),
         load: *load,
     })
-}
-
-/// The corners of the convex hull of points on the ground (Andrew's monotone chain in x and z).
-fn convex_hull(mut points: Vec<Point3<f64>>) -> Vec<Point3<f64>> {
-    points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.z.total_cmp(&b.z)));
-    points.dedup_by(|a, b| (a.x - b.x).abs() < 1e-6 && (a.z - b.z).abs() < 1e-6);
-    if points.len() < 3 {
-        return points;
-    }
-    let turn =
-        |o: &Point3<f64>, a: &Point3<f64>, b: &Point3<f64>| (a.x - o.x) * (b.z - o.z) - (a.z - o.z) * (b.x - o.x);
-    let half = |points: &mut dyn Iterator<Item = &Point3<f64>>| {
-        let mut chain: Vec<Point3<f64>> = vec![];
-        for p in points {
-            while chain.len() > 1 && turn(&chain[chain.len() - 2], &chain[chain.len() - 1], p) <= 1e-9 {
-                chain.pop();
-            }
-            chain.push(*p);
-        }
-        chain.pop();
-        chain
-    };
-    let mut hull = half(&mut points.iter());
-    hull.extend(half(&mut points.iter().rev()));
-    hull
 }

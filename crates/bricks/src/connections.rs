@@ -8,7 +8,6 @@
 use std::collections::HashMap;
 
 use nalgebra::{Matrix3, Point3, Vector3};
-use serde::Serialize;
 
 use crate::flat::Shapes;
 use crate::ldraw::file::{Affine, FileId, LdrawFile, StudSite};
@@ -24,6 +23,11 @@ const GRIP_LDU: f64 = 6.4;
 const BLOCKED_LDU: f64 = 5.2;
 /// The part of a stud's height that must be gripped, from its foot.
 const GRIPPED_HEIGHT_LDU: [f64; 2] = [0.5, 3.5];
+
+/// Half the distance of two studs, LDraw units.
+const HALF_STUD_LDU: f64 = 10.0;
+/// So many studs of a part's length and width are looked at to see whether it could grip any.
+const MOST_STUDS: i32 = 8;
 
 /// A stud of one brick in the grip of another.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -43,38 +47,42 @@ pub struct Connection {
 pub struct Connections {
     /// Every gripped stud, by brick with the stud.
     pub studs: Vec<Connection>,
-    /// For each brick, whether its part has stud data or is held by a stud: what we can say something about.
+    /// For each brick, whether it has studs, is held by one, or could be.
     pub covered: Vec<bool>,
 }
 
-/// A group of bricks that hold together.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Group {
-    /// Indices of the bricks, ascending.
-    pub bricks: Vec<usize>,
+/// Disjoint sets of numbered things.
+pub(crate) struct Sets {
+    /// Towards the smallest member of the set.
+    parent: Vec<usize>,
 }
 
-impl Connections {
-    /// The groups of bricks that hold together, largest first.
-    pub fn groups(&self) -> Vec<Group> {
-        let mut root: Vec<usize> = (0..self.covered.len()).collect();
-        fn find(root: &mut [usize], mut brick: usize) -> usize {
-            while root[brick] != brick {
-                root[brick] = root[root[brick]];
-                brick = root[brick];
-            }
-            brick
+impl Sets {
+    pub fn new(count: usize) -> Self {
+        Self { parent: (0..count).collect() }
+    }
+
+    fn find(&mut self, mut item: usize) -> usize {
+        while self.parent[item] != item {
+            self.parent[item] = self.parent[self.parent[item]];
+            item = self.parent[item];
         }
-        for connection in &self.studs {
-            let (a, b) = (find(&mut root, connection.stud_brick), find(&mut root, connection.grip_brick));
-            root[a.max(b)] = a.min(b);
-        }
+        item
+    }
+
+    pub fn join(&mut self, a: usize, b: usize) {
+        let (a, b) = (self.find(a), self.find(b));
+        self.parent[a.max(b)] = a.min(b);
+    }
+
+    /// The sets, members ascending, largest set first.
+    pub fn groups(mut self) -> Vec<Vec<usize>> {
         let mut groups: std::collections::BTreeMap<usize, Vec<usize>> = std::collections::BTreeMap::new();
-        for brick in 0..root.len() {
-            groups.entry(find(&mut root, brick)).or_default().push(brick);
+        for item in 0..self.parent.len() {
+            groups.entry(self.find(item)).or_default().push(item);
         }
-        let mut groups: Vec<Group> = groups.into_values().map(|bricks| Group { bricks }).collect();
-        groups.sort_by_key(|group| std::cmp::Reverse(group.bricks.len()));
+        let mut groups: Vec<Vec<usize>> = groups.into_values().collect();
+        groups.sort_by_key(|group| std::cmp::Reverse(group.len()));
         groups
     }
 }
@@ -163,6 +171,11 @@ impl Finder<'_> {
                 }
             }
         }
+        // A part that could grip a stud from below, as a tile, and has none there is held by nothing: that is known too.
+        let mut could_grip: HashMap<FileId, bool> = HashMap::new();
+        for (covered, brick) in covered.iter_mut().zip(bricks).filter(|(covered, _)| !**covered) {
+            *covered = *could_grip.entry(brick.part).or_insert_with(|| grips_somewhere(self.shapes.get(brick.part)));
+        }
         Connections { studs, covered }
     }
 
@@ -175,6 +188,19 @@ impl Finder<'_> {
         let shape = self.shapes.get(brick.part);
         *self.grips.entry((brick.part, key)).or_insert_with(|| grips_stud(shape, &foot, &axis))
     }
+}
+
+/// Whether a part would grip a stud from below somewhere on the grid of half studs.
+fn grips_somewhere(shape: &PartShape) -> bool {
+    let Some(first) = shape.vertices.first() else { return false };
+    let (low, high) =
+        shape.vertices.iter().fold((first.coords, first.coords), |(l, h), p| (l.inf(&p.coords), h.sup(&p.coords)));
+    let places = |axis: usize| {
+        (1..2 * MOST_STUDS)
+            .map(move |half| low[axis] + HALF_STUD_LDU * f64::from(half))
+            .take_while(move |v| *v < high[axis])
+    };
+    places(0).any(|x| places(2).any(|z| grips_stud(shape, &Point3::new(x, high.y, z), &-Vector3::y())))
 }
 
 /// Whether a part's surfaces hold a stud at `foot` that points along `axis`, all in the part's frame.

@@ -10,8 +10,7 @@
 //! - [`Model::write_self_contained`]: a copy that needs no library;
 //! - [`Model::connections`] and [`Model::check`]: which brick holds which, collisions, equilibrium, a building order;
 //! - [`Model::build_site`]: what a planner of building steps has to know;
-//! - [`random_models`]: seeded models that can be built and stand; [`demo_model`]: the built-in castle;
-//! - [`external_only`]: what of a mesh can be seen from outside.
+//! - [`random_models`]: seeded models that can be built and stand; [`demo_model`]: the built-in castle.
 //!
 //! ```
 //! let text = "0 A tower\n1 4 0 0 0 1 0 0 0 1 0 0 0 1 3001.dat\n0 STEP\n1 15 0 -24 0 1 0 0 0 1 0 0 0 1 3001.dat\n";
@@ -25,16 +24,20 @@
 //! Limits: only this crate knows LDraw units and axes. Textures are not drawn (their fallback geometry is).
 //! Conditional lines are ignored. Meshes of library parts are not closed; those that we draw ourselves are.
 
+mod bodies;
 mod build_order;
 mod check;
 mod clearance;
 mod collisions;
 mod connections;
+mod contact;
+mod convex_hull;
 mod demo;
-mod external;
 mod flat;
 mod info;
+mod joints;
 mod ldraw;
+mod links;
 mod model;
 mod neighbors;
 mod parametric;
@@ -44,11 +47,10 @@ mod statics;
 mod write;
 
 pub use build_order::BuildSite;
-pub use check::{CheckOptions, CheckReport, WeakestConnection};
+pub use check::{CheckOptions, CheckReport, JointCounts, UncoveredPart, WeakestConnection};
 pub use collisions::Collision;
-pub use connections::{Connection, Connections, Group};
+pub use connections::{Connection, Connections};
 pub use demo::demo_model;
-pub use external::{ExternalSummary, external_only};
 pub use flat::{METRES_PER_LDU, MeshOptions, NO_PART, object_from_ldraw};
 pub use info::{BomLine, BoxInfo, ModelInfo};
 pub use ldraw::colors::{Color, ColorCode, ColorTable};
@@ -60,4 +62,7 @@ pub use ldraw::load::MissingPart;
 pub use ldraw::shape::PartShape;
 pub use model::{Model, Occurrence, PartInstance, ReadOptions};
 pub use parametric::drawable_parts;
-pub use random::{RandomModel, RandomOptions, RandomProfile, RandomSummary, Style, random_model, random_models};
+pub use random::{
+    BatchSummary, MostAlike, RandomModel, RandomOptions, RandomProfile, RandomSummary, Spread, Style, random_model,
+    random_models,
+};

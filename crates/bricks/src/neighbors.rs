@@ -56,11 +56,12 @@ impl Neighbors {
         self.candidates(&grown).into_iter().filter(|&index| self.boxes[index].grown(margin).contains(p)).collect()
     }
 
-    /// Pairs of bricks whose boxes overlap by more than `depth` in every direction; ascending.
+    /// Pairs of bricks whose boxes overlap by more than `depth` in every direction (where that is negative: are not
+    /// further apart); ascending.
     pub fn overlapping_pairs(&self, depth: f64) -> Vec<(usize, usize)> {
         let mut pairs = vec![];
         for (a, aabb) in self.boxes.iter().enumerate().filter(|(_, aabb)| !aabb.is_empty()) {
-            for b in self.candidates(aabb) {
+            for b in self.candidates(&aabb.grown((-depth).max(0.0))) {
                 if a < b && overlap(aabb, &self.boxes[b]) > depth {
                     pairs.push((a, b));
                 }

@@ -7,22 +7,24 @@
 //!
 //! - `c_j >= 0`, pressing the two bricks apart along `a` (the bottom of one rests on the top of the other);
 //! - `t_j >= 0`, holding them together along `a` (friction of the clutch);
-//! - two forces across the stud (its flank against tubes and walls), of either sign.
+//! - two forces across the stud (its flank against tubes and walls), of either sign;
+//! - a torque about `a` of either sense, which friction gives at the stud's radius `r`: `q+ - q-`, both at least 0.
 //!
-//! Bricks on the ground are pressed up at the corners of their foot; the ground does not pull. With `T` the clutch
+//! Bricks on the ground are pressed up at the corners of their foot, bricks that lie on others without a stud at the
+//! corners of the common patch; neither pulls. With `T` the clutch
 //! force of one stud, the programme is
 //!
 //! ```text
 //! minimise   load + (a little of all forces)
 //! such that  every brick is in balance,
-//!            sum_j t_j <= load T  for every stud,
-//!            c_j, t_j, ground forces >= 0.
+//!            sum_j t_j + (q+ + q-) / r <= load T  for every stud,
+//!            c_j, t_j, q+, q-, ground forces >= 0.
 //! ```
 //!
 //! `load` is then the largest share of the clutch force that any stud must bear, in the distribution that is kindest
 //! to the studs. The model stands where there is a solution with `load <= 1`; it tips over where there is none. The
-//! solver is Clarabel, an interior-point method. Not modelled: bricks that lean on each other without a stud, bending,
-//! friction on the ground (loads are vertical).
+//! solver is Clarabel, an interior-point method. Not modelled: bricks that lean on each other sideways, bending, friction
+//! on the ground (loads are vertical).
 
 use clarabel::algebra::CscMatrix;
 use clarabel::solver::{DefaultSettings, DefaultSolver, IPSolver, SolverStatus, SupportedConeT};
@@ -49,6 +51,16 @@ pub(crate) struct Body {
     pub ground: Vec<Point3<f64>>,
 }
 
+/// One body lies on another.
+pub(crate) struct Contact {
+    /// Index of the body above.
+    pub upper: usize,
+    /// Index of the body below.
+    pub lower: usize,
+    /// Corners of the patch that they share, LDraw frame.
+    pub corners: Vec<Point3<f64>>,
+}
+
 /// The outcome.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Equilibrium {
@@ -66,7 +78,12 @@ pub(crate) enum Equilibrium {
 }
 
 /// Solves the programme. The connections' brick indices are those of `bodies`.
-pub(crate) fn equilibrium(bodies: &[Body], connections: &[Connection], clutch_n: f64) -> Equilibrium {
+pub(crate) fn equilibrium(
+    bodies: &[Body],
+    connections: &[Connection],
+    contacts: &[Contact],
+    clutch_n: f64,
+) -> Equilibrium {
     let mut programme = Programme::new(bodies.len(), connections.len());
     let load = programme.variable(1.0, false);
     let mut tensions = Vec::with_capacity(connections.len());
@@ -89,6 +106,13 @@ pub(crate) fn equilibrium(bodies: &[Body], connections: &[Connection], clutch_n:
         for direction in [across, beside] {
             pair(direction, foot + axis * 2.0, true);
         }
+        for torque in [axis, -axis] {
+            // A variable of one newton at the stud's radius.
+            let variable = programme.variable(SMALL, true);
+            programme.torque(variable, connection.grip_brick, &(torque * STUD_RADIUS_LDU));
+            programme.torque(variable, connection.stud_brick, &(-torque * STUD_RADIUS_LDU));
+            held.push(variable);
+        }
         for &variable in &held {
             programme.clutch(index, variable, 1.0);
         }
@@ -102,6 +126,13 @@ pub(crate) fn equilibrium(bodies: &[Body], connections: &[Connection], clutch_n:
         for corner in &body.ground {
             let variable = programme.variable(SMALL, true);
             programme.force(variable, body, index, &-Vector3::y(), corner);
+        }
+    }
+    for Contact { upper, lower, corners } in contacts {
+        for corner in corners {
+            let variable = programme.variable(SMALL, true);
+            programme.force(variable, &bodies[*upper], *upper, &-Vector3::y(), corner);
+            programme.force(variable, &bodies[*lower], *lower, &Vector3::y(), corner);
         }
     }
     match programme.solve() {
@@ -152,6 +183,15 @@ impl Programme {
         for (offset, value) in force.iter().chain(torque.iter()).enumerate() {
             if value.abs() > 1e-12 {
                 self.entries.push((6 * index + offset, variable, *value));
+            }
+        }
+    }
+
+    /// A torque of one newton times LDraw unit times the variable, on a body.
+    fn torque(&mut self, variable: usize, index: usize, torque: &Vector3<f64>) {
+        for (offset, value) in (torque / LEVER_LDU).iter().enumerate() {
+            if value.abs() > 1e-12 {
+                self.entries.push((6 * index + 3 + offset, variable, *value));
             }
         }
     }

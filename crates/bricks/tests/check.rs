@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
-use mb_bricks::{CheckOptions, CheckReport, MeshOptions, Model, demo_model, external_only};
+use mb_bricks::{CheckOptions, CheckReport, MeshOptions, Model, demo_model};
 
 /// Lines of `part x top z quarter-turns` on the grid of studs and plates.
 fn model(lines: &[(&str, f64, i32, f64)]) -> Model {
@@ -156,20 +156,90 @@ fn the_castle_stands() {
     assert_eq!(order, (0..report.parts).collect::<Vec<_>>());
 }
 
+/// Weight of a part, newtons, from the volume that its closed surface encloses.
+fn weight_n(part: &str, options: &CheckOptions) -> f64 {
+    let mesh = model(&[(part, 0.0, 0, 0.0)]).mesh(&MeshOptions::default());
+    let volume_m3: f64 = (0..mesh.triangles.len())
+        .map(|t| {
+            let [a, b, c] = mesh.triangle(t);
+            a.coords.dot(&b.coords.cross(&c.coords)) / 6.0
+        })
+        .sum();
+    volume_m3 * options.density_kg_m3 * 9.80665
+}
+
+/// Lines for a beam on a pillar on a large plate: `studs` pillars of one stud, the beam's near end over the first.
+fn cantilever(beam: &'static str, length: f64, studs: usize) -> Vec<(&'static str, f64, i32, f64)> {
+    let mut lines = vec![("41539", 4.0, 1, 4.0)];
+    lines.push(if studs == 1 { ("3005", 0.5, 4, 0.5) } else { ("3004", 1.0, 4, 0.5) });
+    lines.push((beam, 0.5 * length, 5, 0.5));
+    lines
+}
+
 #[test]
-fn the_outside_of_a_stack_has_no_studs_between_its_bricks() {
-    let mesh = model(&[("3001", 2.0, 3, 1.0), ("3001", 2.0, 6, 1.0)]).mesh(&MeshOptions::default());
-    let (outside, summary) = external_only(&mesh);
-    assert_eq!(outside.triangles.len(), summary.kept);
-    assert!((0.1..0.9).contains(&summary.removed_area), "{summary:?}");
-    // The studs of the lower brick are hidden in the upper one; the walls around them stay.
-    let part_above = |mesh: &mb_mesh::TriangleMesh, part: u32, height: f64| {
-        let parts = mesh.triangle_parts.as_ref().unwrap();
-        (0..mesh.triangles.len()).any(|t| parts[t] == part && mesh.triangle(t).iter().all(|p| p.y > height))
+fn a_beam_on_one_stud_pulls_as_the_lever_says() {
+    // One stud of radius r holds a beam of weight W whose middle is d away: it presses with c on the near edge and
+    // pulls with t on the far one. c - t = W and (c + t) r = W d, so t = W (d / r - 1) / 2.
+    let options = CheckOptions::default();
+    for (beam, length) in [("3023b", 2.0), ("3623", 3.0), ("3710", 4.0), ("3666", 6.0), ("3460", 8.0)] {
+        let (d, r) = (20.0 * (0.5 * length - 0.5), 6.0);
+        let expected = (weight_n(beam, &options) * (d / r - 1.0) / 2.0 / options.clutch_n).max(0.0);
+        let lines = cantilever(beam, length, 1);
+        let load = |options: &CheckOptions| model(&lines).check(options).unwrap();
+        let found = load(&options).weakest.unwrap();
+        assert!((found.load - expected).abs() < 0.01 * expected, "{beam}: {} for {expected}", found.load);
+        assert_eq!((found.stud_brick, found.grip_brick, found.studs), (1, 2, 1));
+        // On both sides of the tipping point.
+        for (share, stands) in [(1.02, true), (0.98, false)] {
+            let clutch_n = options.clutch_n * expected * share;
+            assert_eq!(load(&CheckOptions { clutch_n, ..options }).stable, stands, "{beam} at {share}");
+        }
+    }
+}
+
+#[test]
+fn a_beam_on_two_studs_pulls_both_as_hard_as_their_levers_allow() {
+    // Studs at 0 and 20, the beam's middle at d. It turns about the far edge of the second stud, 26 away; both studs
+    // pull with their limit at their near edges, with levers of 32 and 12: load = W (d - 26) / (44 T).
+    let options = CheckOptions::default();
+    for (beam, length) in [("3666", 6.0), ("3460", 8.0), ("4477", 10.0), ("60479", 12.0)] {
+        let d = 20.0 * (0.5 * length - 0.5);
+        let expected = weight_n(beam, &options) * (d - 26.0) / 44.0 / options.clutch_n;
+        let found = model(&cantilever(beam, length, 2)).check(&options).unwrap().weakest.unwrap();
+        assert!((found.load - expected).abs() < 0.01 * expected, "{beam}: {} for {expected}", found.load);
+        assert_eq!(found.studs, 2);
+    }
+}
+
+#[test]
+fn a_leaning_tower_falls_where_its_centre_of_mass_leaves_its_foot() {
+    // Plates 2 x 4, each `shift` studs further than the one below. With clutch to spare, the pile tips as a whole:
+    // its middle lies (n - 1) shift / 2 beyond that of its foot, which is 4 long.
+    let strong = CheckOptions { clutch_n: 1e3, ..CheckOptions::default() };
+    for count in [3, 4, 5, 6, 8] {
+        let lines: Vec<_> = (0..count).map(|level| ("3020", 2.0 + f64::from(level), 1 + level, 1.0)).collect();
+        let middle = f64::from(count - 1) / 2.0;
+        // At exactly 2 it balances on an edge; that is nobody's tower.
+        if (middle - 2.0).abs() > 0.1 {
+            assert_eq!(model(&lines).check(&strong).unwrap().stable, middle < 2.0, "{count}");
+        }
+    }
+}
+
+#[test]
+fn bricks_that_lie_on_others_are_judged_by_their_weight() {
+    // A tile carries without holding: a brick on it stays while its middle is over the tile.
+    let lying = |x: f64| check(&[("3068b", 1.0, 1, 1.0), ("3001", x, 4, 1.0)]);
+    for (x, stays) in [(1.0, true), (1.9, true), (2.1, false), (2.9, false)] {
+        let report = lying(x);
+        assert!(!report.connected);
+        assert_eq!((report.stable, report.resting_parts == [1]), (stays, true), "{x}: {:?}", report.notes);
+    }
+    // Its weight bears on what carries it: on the end of a beam it pulls the beam off its stud.
+    let on_beam = |lines: &[(&'static str, f64, i32, f64)]| {
+        let beam: Vec<_> = cantilever("3460", 8.0, 1).into_iter().chain(lines.iter().copied()).collect();
+        check(&beam).weakest.unwrap().load
     };
-    assert!(part_above(&mesh, 0, 0.0097) && !part_above(&outside, 0, 0.0097));
-    assert!(part_above(&outside, 1, 0.0193));
-    let (size, outer) = (mesh.bounds(), outside.bounds());
-    assert!((size.min - outer.min).norm() < 1e-12 && (size.max - outer.max).norm() < 1e-12);
-    assert_eq!(outside.triangle_colors.unwrap().len(), summary.kept);
+    let (bare, tiled) = (on_beam(&[]), on_beam(&[("3069b", 7.0, 6, 0.5)]));
+    assert!(on_beam(&[("3069b", 7.0, 6, 0.5), ("3004", 7.0, 9, 0.5)]) > tiled && tiled > bare);
 }

@@ -4,13 +4,13 @@
 
 use std::collections::BTreeSet;
 
-use mb_bricks::{CheckOptions, Model, RandomOptions, RandomProfile, random_model, random_models};
+use mb_bricks::{BatchSummary, CheckOptions, Model, RandomOptions, RandomProfile, Style, random_model, random_models};
 use mb_job::Silent;
 
 #[test]
 fn a_batch_is_sound_varied_and_repeatable() {
     let options = RandomOptions { seed: 7, ..RandomOptions::default() };
-    let batch = random_models(&options, 5, &Silent).unwrap();
+    let batch = random_models(&options, 8, &Silent).unwrap();
     let mut texts = BTreeSet::new();
     let mut styles = BTreeSet::new();
     for random in &batch {
@@ -19,6 +19,7 @@ fn a_batch_is_sound_varied_and_repeatable() {
         assert!((25..=150).contains(&random.summary.parts));
         assert!(random.summary.size_mm.iter().all(|&mm| mm <= 250.0));
         assert!(random.summary.size_mm.iter().any(|&mm| mm >= 80.0));
+        assert!(random.summary.tilt_deg > 5.0 && random.summary.height_mm == random.summary.size_mm[1]);
         assert_eq!(random.summary.bricks.values().sum::<usize>(), random.summary.parts);
         assert!(random.model.info().steps > 5);
         texts.insert(random.model.to_ldraw());
@@ -29,6 +30,11 @@ fn a_batch_is_sound_varied_and_repeatable() {
     }
     assert_eq!(texts.len(), batch.len());
     assert!(styles.len() > 1);
+    let together = BatchSummary::of(&batch);
+    assert_eq!((together.models, together.styles.values().sum::<usize>()), (8, 8));
+    assert_eq!(together.bricks.values().sum::<usize>(), together.colors.values().sum::<usize>());
+    assert!(together.parts.min <= together.parts.median && together.parts.median <= together.parts.max);
+    assert!(together.most_alike.unwrap().shared < 0.95);
     let again = random_model(&options, 3).unwrap();
     assert_eq!(again.model.to_ldraw(), batch[3].model.to_ldraw());
 }
@@ -37,6 +43,40 @@ fn a_batch_is_sound_varied_and_repeatable() {
 fn the_number_of_bricks_is_kept() {
     let options = RandomOptions { bricks: 60, ..RandomOptions::default() };
     assert_eq!(random_model(&options, 0).unwrap().summary.parts, 60);
+}
+
+#[test]
+fn every_style_is_built_where_it_is_asked_for() {
+    for style in Style::ALL {
+        let profile = RandomProfile { styles: [(style, 1.0)].into(), ..RandomProfile::default() };
+        let options = RandomOptions { seed: 1, profile, ..RandomOptions::default() };
+        let summary = random_model(&options, 0).unwrap().summary;
+        assert_eq!(summary.style, style);
+    }
+}
+
+#[test]
+fn a_profile_of_few_bricks_in_one_colour_is_kept_to() {
+    let text = "max_colors = 1\nmin_size_mm = 60.0\nmax_size_mm = 120.0\n[bricks]\n3001 = 2.0\n3003 = 1.0\n3004 = 1.0\n\
+                3022 = 1.0\n[colors]\n4 = 1.0\n";
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("profile.toml");
+    std::fs::write(&path, text).unwrap();
+    let profile = RandomProfile::read(&path).unwrap();
+    let batch = random_models(&RandomOptions { seed: 3, bricks: 30, profile }, 3, &Silent).unwrap();
+    for random in batch {
+        assert_eq!(random.summary.parts, 30);
+        assert!(
+            random
+                .summary
+                .bricks
+                .keys()
+                .all(|part| { ["3001.dat", "3003.dat", "3004.dat", "3022.dat"].contains(&part.as_str()) })
+        );
+        assert_eq!(random.summary.colors.len(), 1);
+        let longest = random.summary.size_mm.into_iter().fold(0.0, f64::max);
+        assert!((60.0..=121.6).contains(&longest), "{longest}");
+    }
 }
 
 #[test]

@@ -3,7 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
-use mb_bricks::{MeshOptions, Model as BrickModel, RandomOptions, RandomProfile, random_models};
+use mb_bricks::{
+    BatchSummary, CheckReport, MeshOptions, Model as BrickModel, RandomModel, RandomOptions, RandomProfile,
+    random_models,
+};
 use mb_instructions::{Form, Plan};
 use mb_job::{Error, InputError, Result};
 use serde_json::json;
@@ -12,6 +15,9 @@ use super::Seed;
 use super::parts::{Parts, PartsArgument};
 use crate::outcome::Outcome;
 use crate::terminal::Terminal;
+
+/// So many collisions, and kinds of parts, are listed for people; the document has all.
+const SHOWN: usize = 5;
 
 /// Brick models: LDraw and Studio files, built-in bricks
 #[derive(Debug, Subcommand)]
@@ -111,6 +117,10 @@ pub struct Mesh {
     #[arg(long)]
     external_only: bool,
 
+    /// One object for the whole model, where the format knows objects; otherwise each brick is one
+    #[arg(long)]
+    one_object: bool,
+
     /// Output; the ending chooses the format
     #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
@@ -123,12 +133,18 @@ impl Mesh {
         }
         let model = self.model.read()?;
         let mesh = model.mesh(&MeshOptions { clearance_mm: self.clearance });
-        let (mesh, external) = if self.external_only {
-            let (mesh, external) = mb_bricks::external_only(&mesh);
-            (mesh, Some(external))
+        let (mut mesh, external) = if self.external_only {
+            let (mesh, outside) = mb_render::outside_only(&mesh);
+            let removed = outside.triangles - outside.kept;
+            let external = json!({ "triangles": outside.triangles, "kept": outside.kept, "removed": removed,
+                                   "removed_area": outside.removed_area, "changed_pixels": outside.changed_pixels });
+            (mesh, external)
         } else {
-            (mesh, None)
+            (mesh, json!(null))
         };
+        if self.one_object {
+            mesh.triangle_parts = None;
+        }
         mb_mesh::write_mesh(&self.out, &mesh)?;
         let (vertices, triangles) = (mesh.vertices.len(), mesh.triangles.len());
         let warnings = model.info().warnings;
@@ -159,35 +175,54 @@ pub struct Random {
     #[arg(short, long, value_name = "FILE.ldr|DIR")]
     out: PathBuf,
 
+    /// Also draw all models into one picture
+    #[arg(long, value_name = "FILE.png")]
+    contact_sheet: Option<PathBuf>,
+
     #[command(flatten)]
     seed: Seed,
 }
 
 impl Random {
     fn run(&self, terminal: &Terminal) -> Result<Outcome> {
-        let profile = match &self.profile {
-            Some(path) => {
-                let text = std::fs::read_to_string(path).map_err(|e| InputError::unreadable(path, &e))?;
-                toml::from_str(&text).map_err(|e| InputError::new(path, e.to_string()))?
-            }
-            None => RandomProfile::default(),
-        };
+        let profile = self.profile.as_ref().map_or_else(|| Ok(RandomProfile::default()), RandomProfile::read)?;
         let options = RandomOptions { bricks: self.bricks, seed: self.seed.seed, profile };
         let models = random_models(&options, self.count, terminal)?;
         let one_file = self.count == 1 && self.out.extension().is_some();
         let mut text = String::new();
-        for random in &models {
-            let path = if one_file {
-                self.out.clone()
-            } else {
-                self.out.join(format!("random_{:03}.ldr", random.summary.index))
-            };
-            random.model.write_ldraw(&path)?;
-            let [x, y, z] = random.summary.size_mm;
-            text += &format!("{}: {} bricks, {x:.0} x {y:.0} x {z:.0} mm\n", path.display(), random.summary.parts);
+        for RandomModel { model, summary, .. } in &models {
+            let path =
+                if one_file { self.out.clone() } else { self.out.join(format!("random_{:03}.ldr", summary.index)) };
+            model.write_ldraw(&path)?;
+            let [x, y, z] = summary.size_mm;
+            let style = serde_json::to_value(summary.style).unwrap_or_default();
+            text += &format!(
+                "{}: {}, {} bricks, {x:.0} x {y:.0} x {z:.0} mm, {:.0} % overhang\n",
+                path.display(),
+                style.as_str().unwrap_or("model"),
+                summary.parts,
+                100.0 * summary.overhang
+            );
+        }
+        if let Some(path) = &self.contact_sheet {
+            let meshes: Vec<_> = models.iter().map(|random| random.model.mesh(&MeshOptions::default())).collect();
+            mb_image::write_rgb_png(path, &mb_pipeline::contact_sheet(&meshes, terminal)?)?;
+            text += &format!("wrote {}\n", path.display());
         }
         let summaries: Vec<_> = models.iter().map(|m| &m.summary).collect();
-        Outcome::new(&json!({ "seed": self.seed.seed, "models": summaries }), text)
+        let batch = BatchSummary::of(&models);
+        if let Some(alike) = batch.most_alike {
+            text += &format!(
+                "{} models, no two alike: the closest two ({} and {}) share {:.0} % of their cells\n",
+                batch.models,
+                alike.a,
+                alike.b,
+                100.0 * alike.shared
+            );
+        }
+        let document = json!({ "seed": self.seed.seed, "models": summaries, "batch": batch,
+                               "contact_sheet": self.contact_sheet });
+        Outcome::new(&document, text)
     }
 }
 
@@ -201,21 +236,46 @@ pub struct Check {
 impl Check {
     fn run(&self) -> Result<Outcome> {
         let report = self.model.read()?.check(&Default::default())?;
-        let yes = |fact: bool, word: &str| if fact { word.to_owned() } else { format!("not {word}") };
-        let mut text = format!(
-            "{} parts ({} with stud data), {}, {}, {}, {} collisions\n",
-            report.parts,
-            report.covered_parts,
-            yes(report.connected, "connected"),
-            yes(report.stable, "stable"),
-            yes(report.buildable, "buildable in order"),
-            report.collisions.len()
-        );
-        for note in &report.notes {
-            text += &format!("{note}\n");
-        }
+        let text = describe(&report);
         Outcome::new(&report, text)
     }
+}
+
+/// The report in a few lines.
+fn describe(report: &CheckReport) -> String {
+    let yes = |fact: bool, word: &str| if fact { word.to_owned() } else { format!("not {word}") };
+    let joints = report.joints;
+    let mut text = format!(
+        "{} parts, joints known of {}: {} studs, {} bars and fingers, {} pins, {} balls, {} others\n",
+        report.parts, report.covered_parts, report.connections, joints.bars, joints.pins, joints.balls, joints.others
+    );
+    text += &format!(
+        "{}, {}, {}, {} collisions, {} overlaps that may be joints\n",
+        yes(report.connected, "connected"),
+        yes(report.stable, "stable"),
+        yes(report.buildable, "buildable in order"),
+        report.collisions.len(),
+        report.unclear_overlaps.len()
+    );
+    for collision in report.collisions.iter().take(SHOWN) {
+        text += &format!("collision: bricks {} and {}, {:.2} mm deep\n", collision.a, collision.b, collision.depth_mm);
+    }
+    if let Some(weakest) = &report.weakest {
+        text += &format!(
+            "weakest: {} studs between bricks {} and {} bear {:.0} % of their clutch force\n",
+            weakest.studs,
+            weakest.stud_brick,
+            weakest.grip_brick,
+            100.0 * weakest.load
+        );
+    }
+    for part in report.uncovered.iter().take(SHOWN) {
+        text += &format!("joints unknown: {} x {} {}\n", part.count, part.part, part.description);
+    }
+    for note in &report.notes {
+        text += &format!("{note}\n");
+    }
+    text
 }
 
 /// Building instructions: a PDF or an HTML page, and lists for buying the parts

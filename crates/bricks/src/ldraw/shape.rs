@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 
+use mb_mesh::TriangleMesh;
 use nalgebra::Point3;
 
 use super::colors::ColorCode;
@@ -26,6 +27,11 @@ pub struct PartShape {
 }
 
 impl PartShape {
+    /// The triangles alone, LDraw units.
+    pub(crate) fn to_mesh(&self) -> TriangleMesh {
+        TriangleMesh::new(self.vertices.clone(), self.triangles.clone())
+    }
+
     /// Flattens the file `id`; with `with_references` false, only its own polygons.
     pub(crate) fn of(files: &[LdrawFile], id: FileId, with_references: bool) -> Self {
         let mut flattening = Flattening { files, shape: Self::default(), vertex_of_cell: HashMap::new() };

@@ -49,8 +49,27 @@ pub(crate) fn cone() -> Columns {
     }
     foot(&mut solid, 19.0, 18.0);
     hollow_stud(&mut solid, AXIS, 0.0, 8.0);
-    solid.empty(axle_hole(), [8.0, 18.0 + OVERLAP]);
+    solid.empty(reduced_axle_hole(), [8.0, 18.0 + OVERLAP]);
     solid
+}
+
+/// The section of a hole for a cross axle, two of its teeth worn thin.
+fn reduced_axle_hole() -> Outline {
+    let half = [
+        [6.0, 0.0],
+        [5.6023, 2.0],
+        [4.0, 2.0],
+        [2.5, 2.5],
+        [2.0, 4.0],
+        [2.0, 5.6023],
+        [0.0, 6.0],
+        [-2.296, 5.543],
+        [-2.791, 5.213],
+        [-2.5, 2.5],
+        [-5.213, 2.791],
+        [-5.543, 2.296],
+    ];
+    half.into_iter().chain(half.map(|[x, z]| [-x, -z])).collect()
 }
 
 /// The section of a hole for a cross axle.

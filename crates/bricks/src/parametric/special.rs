@@ -2,7 +2,9 @@
 
 use nalgebra::{Point3, Vector3};
 
-use super::block::{BRICK, Footprint, OVERLAP, PIN_RADIUS, PLATE, STUD_RADIUS, WALL, hollow, hollow_stud, stud, tile};
+use super::block::{
+    BRICK, Footprint, OVERLAP, PIN_RADIUS, PLATE, STUD_RADIUS, WALL, hollow, hollow_stud, stud, studded, tile,
+};
 use super::columns::{CIRCLE_SIDES, Columns, Plane, circle, circle_corner, rectangle};
 use super::slope::stud_holders;
 use crate::ldraw::file::StudSite;
@@ -43,6 +45,19 @@ pub(crate) fn tall_brick() -> Columns {
     solid.empty(footprint.outline(WALL), [WALL, height + OVERLAP]);
     stud_holders(&mut solid, height);
     footprint.squares().into_iter().for_each(|center| stud(&mut solid, center, 0.0));
+    solid
+}
+
+/// A 2 x 8 brick, its long walls stiffened by ribs from every other tube.
+pub(crate) fn long_brick() -> Columns {
+    let mut solid = studded(Footprint { length: 8, width: 2 }, BRICK);
+    for x in [-40.0, 0.0, 40.0] {
+        for side in [-1.0, 1.0] {
+            // From within the tube to within the wall.
+            let z = [side * 7.0, side * (16.0 + OVERLAP)];
+            solid.fill(rectangle([x - 1.0, x + 1.0], z), [WALL - OVERLAP, 18.5]);
+        }
+    }
     solid
 }
 

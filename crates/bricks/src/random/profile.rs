@@ -10,16 +10,54 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Style {
-    /// Narrow and high.
+    /// Narrow and high, with battlements, a roof or a spire.
     Tower,
-    /// Long, thin, ragged on top.
+    /// Long and thin, with windows and a skyline.
     Wall,
-    /// Wide, with parts of different heights.
-    Cluster,
-    /// Two pillars with a deck on them.
+    /// A passage with something above it.
+    Gate,
+    /// Rows of arches, one above the other.
+    Arcade,
+    /// A deck on piers, with stairs or towers.
     Bridge,
+    /// Four walls under a pitched roof.
+    House,
+    /// Towers with walls between them.
+    Castle,
+    /// Columns that carry a roof.
+    Temple,
+    /// Steps on some sides or on all.
+    Pyramid,
+    /// A round wall with openings.
+    Rotunda,
     /// A trunk that spreads out above.
     Tree,
+    /// Beams laid crosswise.
+    Lattice,
+    /// Legs, a body, arms, a head.
+    Figure,
+    /// Grown brick by brick, up, down and sideways.
+    Sculpture,
+}
+
+impl Style {
+    /// All of them.
+    pub const ALL: [Self; 14] = [
+        Self::Tower,
+        Self::Wall,
+        Self::Gate,
+        Self::Arcade,
+        Self::Bridge,
+        Self::House,
+        Self::Castle,
+        Self::Temple,
+        Self::Pyramid,
+        Self::Rotunda,
+        Self::Tree,
+        Self::Lattice,
+        Self::Figure,
+        Self::Sculpture,
+    ];
 }
 
 /// Distributions and limits of random models. As TOML:
@@ -63,9 +101,7 @@ impl Default for RandomProfile {
             max_colors: 5,
             bricks: weights(BRICKS),
             colors: weights(COLORS),
-            styles: [Style::Tower, Style::Wall, Style::Cluster, Style::Bridge, Style::Tree]
-                .map(|style| (style, 1.0))
-                .into(),
+            styles: Style::ALL.map(|style| (style, 1.0)).into(),
         }
     }
 }

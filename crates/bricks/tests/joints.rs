@@ -1,0 +1,120 @@
+//! Joints other than studs: known answers on parts made of one cylinder, and real models.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fmt::Write as _;
+
+use mb_bricks::{CheckOptions, CheckReport, Model, PartLibrary};
+
+/// A cylinder of radius and height 1, as the library's primitive has it, with eight sides.
+fn cylinder() -> String {
+    let mut text = String::from("0 FILE 4-4cyli.dat\n0 Cylinder 1.0\n0 !LDRAW_ORG Primitive\n0 BFC CERTIFY CCW\n");
+    for side in 0..8 {
+        let corner = |side: i32| {
+            let angle = std::f64::consts::TAU * f64::from(side) / 8.0;
+            (angle.cos(), angle.sin())
+        };
+        let ((a, b), (c, d)) = (corner(side), corner(side + 1));
+        let _ = writeln!(text, "4 16 {a} 1 {b} {c} 1 {d} {c} 0 {d} {a} 0 {b}");
+    }
+    text + "0 NOFILE\n"
+}
+
+/// A part of one cylinder along y from 0 to `length`, as a peg or, with a box around it, as a hole.
+fn part(name: &str, radius: f64, length: f64, hollow: bool) -> String {
+    let statement = if hollow { "0 BFC INVERTNEXT\n" } else { "" };
+    format!(
+        "0 FILE {name}\n0 Test part\n0 !LDRAW_ORG Part\n0 BFC CERTIFY CCW\n{statement}\
+         1 16 0 0 0 {radius} 0 0 0 {length} 0 0 0 {radius} 4-4cyli.dat\n0 NOFILE\n"
+    )
+}
+
+/// A brick on the ground, the hole at its place, and the peg shifted.
+fn check(peg: (f64, f64), hole: (f64, f64, bool), shift: [f64; 3], turn: &str) -> CheckReport {
+    let [x, y, z] = shift;
+    let text = format!(
+        "0 FILE m.ldr\n1 4 0 0 0 1 0 0 0 1 0 0 0 1 hole.dat\n1 4 {x} {y} {z} {turn} peg.dat\n0 NOFILE\n{}{}{}",
+        part("hole.dat", hole.0, hole.1, hole.2),
+        part("peg.dat", peg.0, peg.1, false),
+        cylinder()
+    );
+    Model::from_text(&text, "m.mpd", None).unwrap().check(&CheckOptions::default()).unwrap()
+}
+
+const UPRIGHT: &str = "1 0 0 0 1 0 0 0 1";
+const TILTED: &str = "1 0 0 0 .995 -.0998 0 .0998 .995";
+const LYING: &str = "0 1 0 -1 0 0 0 0 1";
+
+#[test]
+fn pegs_in_holes_of_their_size_are_joined() {
+    let joined = |peg, hole, shift, turn| {
+        let report = check(peg, hole, shift, turn);
+        let joints = report.joints;
+        let count = joints.bars + joints.pins + joints.others;
+        assert_eq!(count > 0, report.covered_parts == 2 && report.connected, "{report:?}");
+        count
+    };
+    let hole = (4.0, 8.0, true);
+    assert_eq!(joined((4.0, 20.0), hole, [0.0, -6.0, 0.0], UPRIGHT), 1);
+    // A pin with play, and one that is gripped.
+    assert_eq!(joined((3.5, 20.0), hole, [0.0, -6.0, 0.0], UPRIGHT), 1);
+    assert_eq!(joined((4.3, 20.0), hole, [0.0, -6.0, 0.0], UPRIGHT), 1);
+    // Turned over, still on the axis.
+    assert_eq!(joined((4.0, 20.0), hole, [0.0, 10.0, 0.0], "1 0 0 0 -1 0 0 0 -1"), 1);
+    // Too thin, too thick, beside, above, tilted, across.
+    assert_eq!(joined((2.5, 20.0), hole, [0.0, -6.0, 0.0], UPRIGHT), 0);
+    assert_eq!(joined((5.0, 20.0), hole, [0.0, -6.0, 0.0], UPRIGHT), 0);
+    assert_eq!(joined((4.0, 20.0), hole, [1.0, -6.0, 0.0], UPRIGHT), 0);
+    assert_eq!(joined((4.0, 20.0), hole, [0.0, -19.8, 0.0], UPRIGHT), 0);
+    assert_eq!(joined((4.0, 20.0), hole, [0.0, -6.0, 0.0], TILTED), 0);
+    assert_eq!(joined((4.0, 20.0), hole, [0.0, 4.0, 0.0], LYING), 0);
+    // Two pegs on one axis are no joint unless they are fingers that meet.
+    assert_eq!(joined((6.0, 20.0), (6.0, 8.0, false), [0.0, -6.0, 0.0], UPRIGHT), 0);
+    assert_eq!(joined((4.0, 8.0), (4.0, 8.0, false), [0.0, -8.0, 0.0], UPRIGHT), 1);
+    assert_eq!(joined((4.0, 8.0), (4.0, 8.0, false), [0.0, -10.0, 0.0], UPRIGHT), 0);
+}
+
+#[test]
+fn kinds_of_joints_are_told_apart_and_do_not_collide() {
+    let bar = check((4.0, 20.0), (4.0, 8.0, true), [0.0, -6.0, 0.0], UPRIGHT);
+    let pin = check((6.0, 20.0), (6.0, 8.0, true), [0.0, -6.0, 0.0], UPRIGHT);
+    let wheel = check((9.0, 20.0), (9.0, 8.0, true), [0.0, -6.0, 0.0], UPRIGHT);
+    assert_eq!((bar.joints.bars, pin.joints.pins, wheel.joints.others), (1, 1, 1));
+    for report in [bar, pin, wheel] {
+        assert_eq!((report.collisions, report.unclear_overlaps), (vec![], vec![]));
+        assert!(report.uncovered.is_empty() && report.notes.is_empty(), "{:?}", report.notes);
+    }
+}
+
+#[test]
+fn parts_without_known_joints_are_named_and_do_no_harm() {
+    // A post that enters another brick without a hole for it.
+    let report = check((4.0, 20.0), (9.0, 8.0, false), [3.0, -6.0, 0.0], UPRIGHT);
+    assert_eq!((report.covered_parts, report.collisions.len()), (0, 0));
+    assert!(report.stable && report.connected);
+    assert_eq!(report.uncovered.iter().map(|part| part.count).sum::<usize>(), 2);
+    assert!(report.notes.iter().any(|note| note.contains("2 of 2 parts have no known joint")), "{:?}", report.notes);
+}
+
+#[test]
+fn official_models_make_sense() {
+    let Some(library) = mb_testdata::find("ldraw/parts.zip") else { return };
+    let library = PartLibrary::open(library).unwrap();
+    // Model; share of covered parts and share of parts in collisions that are the least and the most.
+    for (name, covered, colliding) in [
+        ("1180-1-moon-buggy", 1.0, 0.1),
+        ("5920-1-island-racer", 0.9, 0.1),
+        ("21022-1-lincoln-memorial", 1.0, 0.0),
+        ("40448-1-vintage-car", 1.0, 0.06),
+    ] {
+        let Some(path) = mb_testdata::find(&format!("ldraw/models/{name}.mpd")) else { return };
+        let report = Model::read(path, Some(&library)).unwrap().check(&CheckOptions::default()).unwrap();
+        let parts = report.parts as f64;
+        assert!(report.covered_parts as f64 >= covered * parts, "{name}: {} covered", report.covered_parts);
+        assert!(report.collisions.len() as f64 <= colliding * parts, "{name}: {:?}", report.collisions);
+        assert!(report.stable, "{name}: {:?}", report.notes);
+        assert!(report.joints.bars > 0, "{name}: {:?}", report.joints);
+        let uncovered: usize = report.uncovered.iter().map(|part| part.count).sum();
+        assert_eq!(uncovered + report.covered_parts, report.parts);
+    }
+}
