@@ -8,6 +8,7 @@ use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::cameras::CameraResiduals;
 use crate::dataset::RayDataset;
 use crate::model::Model;
 
@@ -41,6 +42,7 @@ const MAX_POINTS: usize = 1 << 28;
 pub fn extract(
     model: &dyn Model,
     data: &RayDataset,
+    cameras: &CameraResiduals,
     options: &SurfaceOptions,
     progress: &dyn Progress,
 ) -> Result<TriangleMesh> {
@@ -69,7 +71,7 @@ pub fn extract(
         mesh.vertices.iter().map(|v| Point3::from(v.coords * spacing - Vector3::repeat(1.0))).collect();
     mesh.vertices = scene.iter().map(|p| region.world_from_scene(p)).collect();
     if options.cull {
-        mesh = cull(mesh, data, options.voxel_mm * 1e-3, progress)?;
+        mesh = cull(mesh, data, cameras, options.voxel_mm * 1e-3, progress)?;
         if mesh.triangles.is_empty() {
             return Err(Error::Failed("no camera sees the surface that was found; check the poses".to_owned()));
         }
@@ -124,12 +126,18 @@ fn evaluate(model: &dyn Model, n: usize, spacing: f32, progress: &dyn Progress) 
 }
 
 /// Keeps triangles with a vertex that some training camera sees.
-fn cull(mesh: TriangleMesh, data: &RayDataset, voxel_m: f64, progress: &dyn Progress) -> Result<TriangleMesh> {
+fn cull(
+    mesh: TriangleMesh,
+    data: &RayDataset,
+    cameras: &CameraResiduals,
+    voxel_m: f64,
+    progress: &dyn Progress,
+) -> Result<TriangleMesh> {
     let scene = Scene::new(&mesh);
     let mut seen = vec![false; mesh.vertices.len()];
     let steps = Steps::new(progress, "culling to what cameras saw", data.views().len());
-    for view in data.views() {
-        let cam_from_world = view.world_from_cam.inverse();
+    for (index, view) in data.views().iter().enumerate() {
+        let cam_from_world = cameras.world_from_cam(data, index).inverse();
         let depth =
             scene.depth(&RenderView { intrinsics: view.intrinsics, size: view.size(), cam_from_frame: cam_from_world });
         seen.par_iter_mut().zip(&mesh.vertices).filter(|(seen, _)| !**seen).for_each(|(seen, v)| {

@@ -169,7 +169,7 @@ pub fn reconstruct(
     let options = FieldOptions { data: all, ..options.clone() };
     let data = RayDataset::open(sequence, &options.data, progress)?;
     let Trained { model, cameras, summary: training } = options.train(&data, progress)?;
-    let mesh = extract(model.as_ref(), &data, &options.surface, progress)?;
+    let mesh = extract(model.as_ref(), &data, &cameras, &options.surface, progress)?;
     if let Some(folder) = cameras_to.filter(|_| cameras.size().is_some()) {
         write_cameras(folder, &data, &cameras)?;
     }

@@ -1,7 +1,8 @@
 //! A grid of cells that may hold something, so that samples are spent where matter is.
 //!
-//! The grid covers the unit cube. Each cell keeps a running maximum of a field's density, `v = max(decay v, density)`
-//! at a random point of the cell (instant-ngp has 0.95). A sixteenth of the cells is refreshed at a time, in turn.
+//! The grid covers the unit cube. Each cell keeps a running maximum of what its owner asks a field for (a density, the
+//! optical thickness of a step, a nearness), `v = max(decay v, found)` at a random point of the cell (instant-ngp has
+//! 0.95). A sixteenth of the cells is refreshed at a time, in turn.
 
 use mb_job::rng;
 use rand::RngExt;
@@ -11,7 +12,7 @@ use rayon::prelude::*;
 #[derive(Debug, Clone)]
 pub struct OccupancyGrid {
     resolution: usize,
-    /// Running maximum of the density; infinite before the first look.
+    /// Running maximum; infinite before the first look.
     pub values: Vec<f32>,
     /// What the last decision compared with (one number). [`Self::raise`] touches only cells above it, so values and
     /// threshold give the same decision again.
@@ -79,9 +80,9 @@ impl OccupancyGrid {
     /// which each ask for one point,
     /// training itself has asked for hundreds, and a thin sheet is not forgotten.
     pub fn raise(&mut self, seen: &[(u32, f32)]) {
-        for (cell, density) in seen {
+        for (cell, found) in seen {
             let value = &mut self.values[*cell as usize];
-            *value = value.max(*density);
+            *value = value.max(*found);
         }
     }
 

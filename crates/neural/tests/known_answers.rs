@@ -49,7 +49,7 @@ fn photographs(n: usize, hit: impl Fn(Vector3<f64>, Vector3<f64>) -> Option<Vect
                     let p = Point2::new(x as f64 + offset(s % 4), y as f64 + offset(s / 4));
                     let ray = INTRINSICS.ray(&p, &pose);
                     if let Some(p) = hit(ray.origin.coords - CENTER, ray.direction.normalize()) {
-                        sum += Vector3::new(70.0, 90.0, 50.0).component_mul(&p).map(|v| 0.5 + 0.4 * v.sin());
+                        sum += Vector3::new(140.0, 180.0, 100.0).component_mul(&p).map(|v| 0.5 + 0.4 * v.sin());
                         cover += 1.0 / 16.0;
                     }
                 }
@@ -114,7 +114,8 @@ fn surface_of(photographs: Vec<Photograph>) -> mb_mesh::TriangleMesh {
     let json = serde_json::to_value(&options).expect("plain data");
     let mut neus = Neus::new(options, &data);
     run(&mut neus, &data, &json, &RunOptions::default(), &Silent).expect("it converges");
-    extract(&neus, &data, &SurfaceOptions { voxel_mm: 2.0, cull: true }, &Silent).expect("a surface")
+    let cameras = CameraResiduals::new(&CameraOptions::default(), &data);
+    extract(&neus, &data, &cameras, &SurfaceOptions { voxel_mm: 2.0, cull: true }, &Silent).expect("a surface")
 }
 
 /// The photographs are right themselves: the cameras see the object in the middle, the right way round.
@@ -138,10 +139,10 @@ fn a_sphere_comes_back_within_one_percent_of_its_size() {
     assert!(off * 50 < radii.len(), "{off} of {} vertices lie more than 2 % of the diameter off", radii.len());
 }
 
-/// After so short a run the density around flat faces is still a few millimetres thick, and the zero level lies up to
-/// 4 % off; a wrong derivative or frame would lose the box altogether.
+/// After so short a run the middle of a flat face lies up to half a millimetre too deep; a wrong derivative or frame would
+/// lose the box altogether.
 #[test]
-fn a_box_comes_back_within_five_percent_of_its_size() {
+fn a_box_comes_back_within_two_percent_of_its_size() {
     let half = Vector3::new(0.06, 0.045, 0.03);
     let mesh = surface_of(photographs(20, cuboid(half)));
     // Each face: the mean of the vertices near its middle.
@@ -160,7 +161,7 @@ fn a_box_comes_back_within_five_percent_of_its_size() {
             near.iter().sum::<f64>() / near.len() as f64
         };
         let size = side(1.0) - side(-1.0);
-        assert!((size / (2.0 * half[axis]) - 1.0).abs() < 0.05, "axis {axis}: {size} is not {}", 2.0 * half[axis]);
+        assert!((size / (2.0 * half[axis]) - 1.0).abs() < 0.02, "axis {axis}: {size} is not {}", 2.0 * half[axis]);
     }
 }
 
