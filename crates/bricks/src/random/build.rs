@@ -224,7 +224,7 @@ impl<'a> Build<'a> {
             let [width, _, depth] = size.map(f64::from);
             [[cx, cz], [cx + width, cz], [cx, cz + depth], [cx + width, cz + depth]]
         });
-        let hull = convex_hull(corners.map(|[x, z]| [x, z]).collect());
+        let hull = convex_hull(corners.collect());
         // Studs are 20 units long, plates 8 high.
         let height = y * 8.0 / 20.0;
         let inwards = hull.iter().enumerate().map(|(index, a)| {
