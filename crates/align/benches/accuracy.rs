@@ -47,6 +47,9 @@ fn bundle(options: BundleOptions) -> impl Fn(&Sequence) -> Result<String> {
     }
 }
 
+/// Aligns a sequence further and says what error it expects.
+type Stage = Box<dyn Fn(&Sequence) -> Result<String>>;
+
 fn measure(folder: &Path) {
     let all = BundleOptions::default;
     let keypoints = |s: &Sequence| {
@@ -62,7 +65,7 @@ fn measure(folder: &Path) {
             )
         })
     };
-    let mut stages: Vec<(&str, Box<dyn Fn(&Sequence) -> Result<String>>)> =
+    let mut stages: Vec<(&str, Stage)> =
         vec![("keypoints", Box::new(keypoints)), ("refine", Box::new(refine)), ("bundle", Box::new(bundle(all())))];
     if std::env::var_os("ABLATION").is_some() {
         let mut without = |name, options| stages.push((name, Box::new(bundle(options))));

@@ -50,7 +50,8 @@ fn problem() -> Adjustment {
         focal_information: f64::INFINITY,
     };
     let mut normal = || {
-        let (radius, angle) = ((-2.0 * rng.random_range(1e-300..1.0f64).ln()).sqrt(), rng.random_range(0.0..6.283));
+        let (radius, angle) =
+            ((-2.0 * rng.random_range(1e-300..1.0f64).ln()).sqrt(), rng.random_range(0.0..std::f64::consts::TAU));
         radius * f64::cos(angle)
     };
     let mut order: Vec<usize> = (0..CAMERAS).collect();
