@@ -32,7 +32,7 @@ impl Board {
 /// Which board.
 #[derive(Debug, Args)]
 pub struct BoardArgument {
-    /// charuco:COLUMNSxROWS:SQUARE_M:MARKER_M:DICTIONARY[:legacy], grid:COLUMNSxROWS:MARKER_M:GAP_M:DICTIONARY[:FIRST_ID],
+    /// `charuco:COLUMNSxROWS:SQUARE_M:MARKER_M:DICTIONARY[:legacy]`, `grid:COLUMNSxROWS:MARKER_M:GAP_M:DICTIONARY[:FIRST_ID]`,
     /// or a .json or .yml file (docs/formats.md)
     #[arg(long, value_name = "SPEC")]
     board: String,
