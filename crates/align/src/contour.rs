@@ -127,15 +127,20 @@ struct FrameEquations {
     object_right: ObjectVector,
 }
 
-/// Standard deviation of residuals by kind of edge, pixels.
-#[derive(Clone, Copy)]
-struct Noise([f64; EdgeKind::COUNT]);
+/// Standard deviation of residuals.
+struct Noise {
+    /// By kind of edge, over all frames, pixels.
+    px: [f64; EdgeKind::COUNT],
+    /// By frame, in units of the above, at least 1; infinite at coarse levels. A frame that is still far off must not lose
+    /// its edges because all others have found theirs.
+    of_frame: Vec<f64>,
+}
 
 impl Noise {
-    /// Of an observation, its information and the residual from which it does not count.
-    fn of(&self, o: &Observation, limit_px: f64) -> (f64, f64) {
-        let noise_px = self.0[o.visible.kind as usize];
-        ((CORRELATION * noise_px).powi(-2), limit_px.min(TUKEY * noise_px))
+    /// Of an observation of a frame, its information and the residual from which it does not count.
+    fn of(&self, frame: usize, o: &Observation, limit_px: f64) -> (f64, f64) {
+        let noise_px = self.px[o.visible.kind as usize];
+        ((CORRELATION * noise_px).powi(-2), limit_px.min(TUKEY * noise_px * self.of_frame[frame]))
     }
 }
 
@@ -275,26 +280,35 @@ impl ContourFit<'_> {
         object_step.iter().all(|v| v.is_finite())
     }
 
-    /// Standard deviation of the residuals within the limit, from their median, for each kind of edge: outlines before
-    /// the table are sharp, edges of one colour inside the model are not.
+    /// Standard deviation of the residuals within the limit, from their median, for each kind of edge (outlines before
+    /// the table are sharp, edges of one colour inside the model are not) and for each frame.
     fn noise_px(&self, observed: &Observed, limit_px: f64) -> Noise {
-        let mut lengths: Vec<(usize, f64)> = self
+        // 1.4826 makes the median absolute deviation the standard deviation of normal errors.
+        let deviation = |mut lengths: Vec<f64>| {
+            lengths.sort_by(f64::total_cmp);
+            lengths.get(lengths.len() / 2).map(|median| 1.4826 * median)
+        };
+        let lengths: Vec<Vec<(usize, f64)>> = self
             .frames
             .par_iter()
             .zip(&observed.observations)
-            .flat_map_iter(|(frame, list)| {
+            .map(|(frame, list)| {
                 let projection = self.projection(frame, observed.level);
-                list.iter().filter_map(move |o| Some((o.visible.kind as usize, projection.residual(o)?.px.abs())))
+                let length = |o: &Observation| Some((o.visible.kind as usize, projection.residual(o)?.px.abs()));
+                list.iter().filter_map(length).filter(|(_, r)| *r < limit_px).collect()
             })
-            .filter(|(_, r)| *r < limit_px)
             .collect();
-        lengths.sort_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
-        Noise(std::array::from_fn(|kind| {
-            let of_kind = lengths.partition_point(|l| l.0 < kind)..lengths.partition_point(|l| l.0 <= kind);
-            let of_kind = &lengths[of_kind];
-            // 1.4826 makes the median absolute deviation the standard deviation of normal errors.
-            of_kind.get(of_kind.len() / 2).map_or(limit_px, |l| 1.4826 * l.1).max(0.1)
-        }))
+        let px: [f64; EdgeKind::COUNT] = std::array::from_fn(|kind| {
+            let of_kind = lengths.iter().flatten().filter(|(k, _)| *k == kind).map(|(_, r)| *r).collect();
+            deviation(of_kind).unwrap_or(limit_px).max(0.1)
+        });
+        let of_frame = |list: &Vec<(usize, f64)>| {
+            if observed.level > 0 {
+                return f64::INFINITY;
+            }
+            deviation(list.iter().map(|&(kind, r): &(usize, f64)| r / px[kind]).collect()).unwrap_or(1.0).max(1.0)
+        };
+        Noise { px, of_frame: lengths.par_iter().map(of_frame).collect() }
     }
 
     fn equations(&self, observed: &Observed, limit_px: f64, noise: &Noise) -> Equations {
@@ -302,7 +316,8 @@ impl ContourFit<'_> {
             .frames
             .par_iter()
             .zip(&observed.observations)
-            .map(|(frame, list)| {
+            .enumerate()
+            .map(|(index, (frame, list))| {
                 let mut e = FrameEquations {
                     mixed: SMatrix::zeros(),
                     own: self.prior_information(),
@@ -313,7 +328,7 @@ impl ContourFit<'_> {
                 let projection = self.projection(frame, observed.level);
                 for o in list {
                     let Some(Residual { px: r, by_object, by_drift }) = projection.residual(o) else { continue };
-                    let (information, limit_px) = noise.of(o, limit_px);
+                    let (information, limit_px) = noise.of(index, o, limit_px);
                     let weight = tukey(r, limit_px) * information;
                     if weight > 0.0 {
                         e.object += by_object.transpose() * by_object * weight;
@@ -464,7 +479,7 @@ impl ContourFit<'_> {
                 .iter()
                 .filter_map(|o| {
                     let Residual { px: r, by_object, by_drift } = projection.residual(o)?;
-                    let (information, limit_px) = noise.of(o, limit_px);
+                    let (information, limit_px) = noise.of(i, o, limit_px);
                     let weight = tukey(r, limit_px) * information;
                     (weight > 0.0).then_some((o.visible.sample.edge, r * weight, by_object, by_drift))
                 })
