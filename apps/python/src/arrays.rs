@@ -1,5 +1,6 @@
 //! NumPy arrays to images and matrices, and back. Arrays that go out take over the image's memory.
 
+use mb_eval::MetricDepth;
 use mb_geometry::{Camera, ImageSize, Intrinsics, Rigid3};
 use mb_image::Image;
 use nalgebra::{Matrix3, Matrix4};
@@ -34,6 +35,13 @@ pub fn colour_image(name: &str, array: &PyReadonlyArray3<'_, f32>) -> PyResult<I
         return Err(PyValueError::new_err(format!("{name} holds {value}; colours are fractions from 0 to 1")));
     }
     Ok(Image::from_fn(ImageSize::new(width, height), |x, y| std::array::from_fn(|c| view[(y, x, c)])))
+}
+
+/// Depth in metres from `[H, W]`.
+pub fn metric_depth(array: &PyReadonlyArray2<'_, f32>) -> MetricDepth {
+    let view = array.as_array();
+    let (height, width) = view.dim();
+    Image::from_fn(ImageSize::new(width, height), |x, y| f64::from(view[(y, x)]))
 }
 
 /// A 4x4 matrix, row by row.

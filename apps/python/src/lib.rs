@@ -27,6 +27,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(scores::evaluate_views, module)?)?;
     module.add_function(wrap_pyfunction!(scores::evaluate_depth, module)?)?;
     module.add_function(wrap_pyfunction!(scores::evaluate_poses, module)?)?;
+    module.add_function(wrap_pyfunction!(scores::compare_depth, module)?)?;
     module.add_function(wrap_pyfunction!(scores::compare_images, module)?)?;
     module.add_function(wrap_pyfunction!(mesh::render_depth, module)?)?;
     module.add_function(wrap_pyfunction!(mesh::fuse_tsdf, module)?)?;

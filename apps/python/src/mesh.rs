@@ -20,14 +20,17 @@ use crate::sequence::PySequence;
 /// Triangles in metres.
 #[pyclass(name = "Mesh", frozen, module = "mobilebrick")]
 pub struct PyMesh {
-    mesh: TriangleMesh,
+    pub mesh: TriangleMesh,
 }
 
 #[pymethods]
 impl PyMesh {
     #[new]
-    fn new(vertices: PyReadonlyArray2<'_, f64>, triangles: PyReadonlyArray2<'_, u32>) -> PyResult<Self> {
-        let (vertices, triangles) = (vertices.as_array(), triangles.as_array());
+    #[pyo3(signature = (vertices, triangles = None))]
+    fn new(vertices: PyReadonlyArray2<'_, f64>, triangles: Option<PyReadonlyArray2<'_, u32>>) -> PyResult<Self> {
+        let none = Array2::zeros((0, 3));
+        let vertices = vertices.as_array();
+        let triangles = triangles.as_ref().map_or_else(|| none.view(), |triangles| triangles.as_array());
         for (name, shape) in [("vertices", vertices.shape()), ("triangles", triangles.shape())] {
             if shape[1] != 3 {
                 return Err(PyValueError::new_err(format!("{name} have shape {shape:?}, expected (n, 3)")));

@@ -1,19 +1,21 @@
 //! The four scores.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use mb_eval::{
-    DepthOptions, PerceptualMetric, SurfaceOptions, SurfaceProtocol, ViewsOptions, evaluate_depth as eval_depth,
-    evaluate_poses as eval_poses, evaluate_surface as eval_surface, evaluate_views as eval_views,
+    DepthOptions, PerceptualMetric, SurfaceOptions, SurfaceProtocol, SurfaceTruth, ViewsOptions,
+    evaluate_depth as eval_depth, evaluate_poses as eval_poses, evaluate_surface as eval_surface,
+    evaluate_views as eval_views, score_depth, score_surface,
 };
 use mb_perceptual::{Lpips, LpipsNet};
-use numpy::PyReadonlyArray3;
+use numpy::{PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::arrays::colour_image;
+use crate::arrays::{colour_image, metric_depth};
 use crate::calls::{document, run};
+use crate::mesh::PyMesh;
 
 /// One file, or several that belong together.
 #[derive(FromPyObject)]
@@ -31,24 +33,36 @@ impl From<Paths> for Vec<PathBuf> {
     }
 }
 
+/// A surface to score.
+#[derive(FromPyObject)]
+pub enum Surface {
+    Memory(Py<PyMesh>),
+    File(PathBuf),
+}
+
 /// Scores a mesh against the ground truth of a sequence.
 #[pyfunction]
-#[pyo3(signature = (gt, pred, *, protocol = "mobilebrick-2023", points = None, seed = 0))]
+#[pyo3(signature = (gt, pred, *, protocol = "mobilebrick-2023", points = None, seed = 0, thresholds_mm = Vec::new()))]
 pub fn evaluate_surface<'py>(
     py: Python<'py>,
     gt: PathBuf,
-    pred: PathBuf,
+    pred: Surface,
     protocol: &str,
     points: Option<usize>,
     seed: u64,
+    thresholds_mm: Vec<f64>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let protocol = SurfaceProtocol::ALL.into_iter().find(|p| p.name() == protocol).ok_or_else(|| {
-        let names = SurfaceProtocol::ALL.map(SurfaceProtocol::name).join(" and ");
-        PyValueError::new_err(format!("'{protocol}' is no protocol; there are {names}"))
-    })?;
-    let mut options = SurfaceOptions { protocol, seed, ..SurfaceOptions::default() };
+    let protocol: SurfaceProtocol = protocol.parse().map_err(PyValueError::new_err)?;
+    let mut options =
+        SurfaceOptions { protocol, seed, more_thresholds_mm: thresholds_mm, ..SurfaceOptions::default() };
     options.points = points.unwrap_or(options.points);
-    let scores = run(py, |progress| eval_surface(&gt, &pred, &options, progress))?;
+    let scores = run(py, |progress| match &pred {
+        Surface::File(path) => eval_surface(&gt, path, &options, progress),
+        Surface::Memory(mesh) => {
+            let truth = SurfaceTruth::read(&gt, protocol)?;
+            score_surface(&truth, mesh.get().mesh.clone(), Path::new("the given mesh"), &options, progress)
+        }
+    })?;
     document(py, &scores)
 }
 
@@ -93,6 +107,22 @@ pub fn evaluate_depth<'py>(
 pub fn evaluate_poses<'py>(py: Python<'py>, gt: PathBuf, pred: PathBuf) -> PyResult<Bound<'py, PyAny>> {
     let scores = run(py, |_| eval_poses(&gt, &pred))?;
     document(py, &scores)
+}
+
+/// The metrics of two depth maps in memory.
+#[pyfunction]
+pub fn compare_depth<'py>(
+    py: Python<'py>,
+    gt: PyReadonlyArray2<'py, f32>,
+    pred: PyReadonlyArray2<'py, f32>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let (gt, pred) = (metric_depth(&gt), metric_depth(&pred));
+    if gt.size() != pred.size() {
+        return Err(PyValueError::new_err(format!("gt is {} pixels, but pred is {}", gt.size(), pred.size())));
+    }
+    let scores = py.detach(|| score_depth(&[(gt, pred)], &DepthOptions::default()));
+    let scores = scores.ok_or_else(|| PyValueError::new_err("no pixel has a depth above 0 on both sides"))?;
+    document(py, &scores.mean)
 }
 
 /// PSNR and SSIM of two images in memory.

@@ -7,7 +7,7 @@ use mb_capture::{Alignment, Frame, Sequence};
 use numpy::{PyArray2, PyArray3};
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyType};
 
 use crate::arrays::{colour, intrinsics_matrix, plane, pose_matrix};
 use crate::calls::{document, run};
@@ -58,6 +58,11 @@ impl PySequence {
             Some(frame) => Ok(PyFrame { sequence: self.sequence.clone(), frame: frame.clone() }),
             None => Err(PyIndexError::new_err(format!("frame {index} of {count}"))),
         }
+    }
+
+    /// Pickles as its path: loaders with several processes open it anew in each.
+    fn __reduce__<'py>(slf: &Bound<'py, Self>) -> (Bound<'py, PyType>, (PathBuf,)) {
+        (slf.get_type(), (slf.get().sequence.root().to_owned(),))
     }
 
     fn alignment(&self, py: Python<'_>) -> PyResult<PyAlignment> {

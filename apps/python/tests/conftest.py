@@ -6,6 +6,8 @@ import zlib
 import numpy as np
 import pytest
 
+import mobilebrick as mb
+
 WIDTH, HEIGHT = 64, 48
 INTRINSICS = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
 
@@ -41,3 +43,24 @@ def sequence_path(tmp_path):
         write_png(root / "image" / f"{i:06}.png", image)
         write_png(root / "arkit_depth" / f"{i:06}.png", np.full((HEIGHT, WIDTH), 503, np.uint16))
     return root
+
+
+@pytest.fixture
+def scored_path(sequence_path):
+    """The sequence with ground truth: the wall, 20 cm square, and a volume around it of which all is visible."""
+    steps = np.linspace(-0.1, 0.1, 41)
+    x, y = np.meshgrid(steps, steps)
+    vertices = np.stack([x, y, np.full_like(x, 0.503)], axis=-1).reshape(-1, 3)
+    corner = (np.arange(40)[:, None] * 41 + np.arange(40)).reshape(-1, 1)
+    triangles = np.concatenate([corner + [0, 41, 42], corner + [0, 42, 1]]).astype(np.uint32)
+    (sequence_path / "mesh").mkdir()
+    mb.Mesh(vertices, triangles).write(sequence_path / "mesh" / "gt_mesh.ply")
+    resolutions = np.array([60, 60, 20])
+    volume = {
+        "mask": np.ones(resolutions.prod(), bool),
+        "resolutions": resolutions,
+        "voxel_size": 0.01,
+        "min_pts": np.array([-0.3, -0.3, 0.4]),
+    }
+    np.save(sequence_path / "visibility_mask.npy", volume, allow_pickle=True)
+    return sequence_path

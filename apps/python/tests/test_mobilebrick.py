@@ -2,7 +2,9 @@
 
 import json
 import os
+import pickle
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -133,8 +135,43 @@ def test_a_surface_needs_ground_truth(sequence_path, tmp_path):
     mesh.write(tmp_path / "mesh.ply")
     with pytest.raises(mb.InputError):
         mb.evaluate_surface(sequence_path, tmp_path / "mesh.ply")
-    with pytest.raises(ValueError, match="exact-1"):
+    with pytest.raises(ValueError, match="dtu-style-1"):
         mb.evaluate_surface(sequence_path, tmp_path / "mesh.ply", protocol="dtu")
+
+
+def test_surfaces_in_memory_score_like_their_files(scored_path, tmp_path):
+    truth = mb.Mesh.read(scored_path / "mesh" / "gt_mesh.ply")
+    for protocol in ["mobilebrick-2023", "exact-1", "dtu-style-1", "tnt-style-1"]:
+        options = {"protocol": protocol, "points": 2000, "thresholds_mm": [1.0]}
+        moved = mb.Mesh(truth.vertices + [0, 0, 0.002], truth.triangles)
+        moved.write(tmp_path / "moved.ply")
+        scores = mb.evaluate_surface(scored_path, moved, **options)
+        from_file = mb.evaluate_surface(scored_path, tmp_path / "moved.ply", **options)
+        assert [t["threshold_mm"] for t in scores["thresholds"]] == [1.0, 2.5, 5.0]
+        assert scores["chamfer_mm"] == pytest.approx(from_file["chamfer_mm"], abs=1e-3)
+        assert from_file["provenance"]["prediction"]["path"] == str(tmp_path / "moved.ply")
+    exact = mb.evaluate_surface(scored_path, moved, protocol="exact-1", points=2000)
+    assert exact["chamfer_mm"] == pytest.approx(4.0, abs=1e-3) and exact["aligned"]["chamfer_mm"] < 1e-3
+    cloud = mb.evaluate_surface(scored_path, mb.Mesh(truth.vertices), protocol="exact-1", points=2000)
+    assert cloud["pred_to_gt_mm"] == 0 and "point cloud" in cloud["warnings"][0]
+    with pytest.raises(mb.InputError, match="the given mesh: the prediction is in millimetres"):
+        mb.evaluate_surface(scored_path, mb.Mesh(truth.vertices * 1000, truth.triangles))
+
+
+def test_depth_in_memory_has_its_closed_form():
+    depth = np.full((6, 8), 2.0, np.float32)
+    depth[0] = np.nan
+    scores = mb.compare_depth(depth, depth * np.float32(1.25))
+    assert (scores["valid_pixels"], scores["abs_rel"], scores["delta1"]) == (40, 0.25, 0.0)
+    with pytest.raises(ValueError, match="no pixel"):
+        mb.compare_depth(depth, depth * 0)
+    with pytest.raises(ValueError, match="8x6"):
+        mb.compare_depth(depth, depth[:5])
+
+
+def test_sequences_travel_to_other_processes(sequence_path):
+    back = pickle.loads(pickle.dumps(mb.Sequence(sequence_path)))
+    assert (back.path, len(back)) == (sequence_path, 4)
 
 
 def test_other_threads_run_meanwhile():
@@ -174,14 +211,17 @@ def test_ctrl_c_stops_a_call(tmp_path):
     assert b"KeyboardInterrupt" in errors
 
 
-def test_the_quick_start_runs(sequence_path, monkeypatch, capsys):
+def test_the_examples_run(scored_path, monkeypatch, capsys):
     readme = (Path(__file__).parent.parent / "README.md").read_text()
-    (code,) = re.findall(r"```python\n(.*?)```", readme, re.S)
-    assert len([line for line in code.splitlines() if line]) == 10
-    monkeypatch.chdir(sequence_path.parent)
-    exec(compile(code, "README.md", "exec"), {})
-    assert (sequence_path.parent / "fused.ply").exists()
+    quick_start, scores = re.findall(r"```python\n(.*?)```", readme, re.S)
+    assert len([line for line in quick_start.splitlines() if line]) == 10
+    monkeypatch.chdir(scored_path.parent)
+    exec(compile(quick_start, "README.md", "exec"), {})
     assert "is covered by Mesh(" in capsys.readouterr().out
+    shutil.copy(scored_path / "mesh" / "gt_mesh.ply", "prediction.ply")
+    exec(compile(scores, "README.md", "exec"), {})
+    printed = capsys.readouterr().out
+    assert "5.0 mm: F1 1.0" in printed and "0.01" in printed.splitlines()[-1]
 
 
 def test_the_stubs_name_everything():

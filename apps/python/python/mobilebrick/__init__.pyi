@@ -17,8 +17,9 @@ class InputError(ValueError):
 class Sequence:
     """A sequence folder in the MobileBrick layout.
 
-    Opening reads poses and intrinsics; images are read when a frame is asked for them. It has a length and takes
-    indices, so it works as a PyTorch map-style dataset as it is.
+    Opening reads poses and intrinsics; images are read when a frame is asked for them. It has a length, takes indices
+    and can be pickled, so it works as a PyTorch map-style dataset as it is; ``collate_fn`` says what of the frames
+    becomes tensors.
     """
 
     def __init__(self, path: Path) -> None: ...
@@ -88,8 +89,8 @@ class Alignment:
 class Mesh:
     """Triangles, metres, counter-clockwise seen from outside. Without triangles it is a point cloud."""
 
-    def __init__(self, vertices: NDArray[np.float64], triangles: NDArray[np.uint32]) -> None:
-        """``vertices`` [V, 3], ``triangles`` [T, 3] indices of vertices."""
+    def __init__(self, vertices: NDArray[np.float64], triangles: Optional[NDArray[np.uint32]] = None) -> None:
+        """``vertices`` [V, 3], ``triangles`` [T, 3] indices of vertices; without them a point cloud."""
     @staticmethod
     def read(path: Path) -> Mesh:
         """Reads PLY, OBJ, STL or GLB."""
@@ -139,13 +140,16 @@ def fuse_tsdf(
 
 def evaluate_surface(
     gt: Path,
-    pred: Path,
+    pred: Union[Path, Mesh],
     *,
-    protocol: Literal["mobilebrick-2023", "exact-1"] = "mobilebrick-2023",
+    protocol: Literal["mobilebrick-2023", "exact-1", "dtu-style-1", "tnt-style-1"] = "mobilebrick-2023",
     points: Optional[int] = None,
     seed: int = 0,
+    thresholds_mm: Many[float] = (),
 ) -> Dict[str, Any]:
-    """Scores the mesh file ``pred`` against the ground truth in the sequence folder ``gt``."""
+    """Scores ``pred``, a mesh file or a mesh in memory, metres in the sequence's world frame, against the ground truth
+    in the sequence folder ``gt``. ``thresholds_mm`` come beside 2.5 and 5 mm. The document is that of
+    ``mobilebrick eval surface --json``; ``docs/metrics.md`` defines its keys."""
 
 def evaluate_views(
     gt: Path,
@@ -163,6 +167,9 @@ def evaluate_depth(gt: Path, pred: Path, *, confidence: Optional[Path] = None) -
 
 def evaluate_poses(gt: Path, pred: Path) -> Dict[str, Any]:
     """Scores camera poses; each side is a sequence or any folder with ``pose/NNNNNN.txt``."""
+
+def compare_depth(gt: NDArray[np.float32], pred: NDArray[np.float32]) -> Dict[str, Any]:
+    """The metrics of two depth maps [H, W] in metres; a pixel counts where both are finite and above 0."""
 
 def compare_images(gt: NDArray[np.float32], pred: NDArray[np.float32]) -> Dict[str, float]:
     """``psnr`` and ``ssim`` of two images [H, W, 3] with values from 0 to 1."""
