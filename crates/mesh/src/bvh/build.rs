@@ -6,13 +6,20 @@ use rayon::prelude::*;
 use super::{Bvh, Child, MAX_DEPTH, Node};
 use crate::TriangleMesh;
 
+/// Bins on each axis, for many triangles and for few.
 const BINS: usize = 16;
+const FEW_BINS: usize = 8;
+/// As many triangles as this are few.
+const FEW: usize = 48;
+/// Up to so many triangles are always a leaf: testing them costs no more than visiting the nodes above single ones, and
+/// half of the work of building a tree lies in its last two levels.
+const MIN_LEAF: usize = 4;
 /// More triangles than this are always split.
 const MAX_LEAF: usize = 8;
 /// Cost of visiting a node, in units of the cost of testing one triangle.
 const NODE_COST: f32 = 1.0;
 /// Subtrees below this size are built by one thread.
-const PARALLEL_FROM: usize = 8192;
+const PARALLEL_FROM: usize = 32_768;
 /// From this depth on, halves are split by count, so that even a hostile mesh keeps within [`MAX_DEPTH`]:
 /// 2^32 triangles need 32 more levels.
 const COUNT_SPLIT_FROM: usize = MAX_DEPTH - 34;
@@ -89,38 +96,69 @@ pub(super) fn build_without_corners(mesh: &TriangleMesh) -> Bvh {
             finite.then(|| Primitive { bounds: bounds_of(&corners), triangle: index as u32 })
         })
         .collect();
+    let all = bounds(&primitives);
     let (nodes, root) =
-        if primitives.is_empty() { (Vec::new(), Child::default()) } else { subtree(&mut primitives, 0, 0) };
+        if primitives.is_empty() { (Vec::new(), Child::default()) } else { subtree(&mut primitives, &all, 0, 0) };
     let triangles: Vec<u32> = primitives.par_iter().map(|p| p.triangle).collect();
     Bvh { nodes, root, corners: Vec::new(), triangles }
 }
 
-/// Builds the subtree over `primitives`, which stand at `first` in the final order and are reordered in place. Inner
-/// nodes are numbered from 0 within the subtree, its root first.
-fn subtree(primitives: &mut [Primitive], first: u32, depth: usize) -> (Vec<Node>, Child) {
+/// Builds the subtree over `primitives`, which lie in the box `all`, stand at `first` in the final order and are reordered
+/// in place. Inner nodes are numbered from 0 within the subtree, its root first.
+fn subtree(primitives: &mut [Primitive], all: &Box3, first: u32, depth: usize) -> (Vec<Node>, Child) {
     let count = primitives.len();
-    let Some(middle) = split(primitives, depth) else {
+    if count < PARALLEL_FROM {
+        let mut nodes = Vec::with_capacity(count / 2);
+        let root = grow(primitives, all, first, depth, &mut nodes);
+        return (nodes, root);
+    }
+    let Some(middle) = split(primitives, all, depth) else {
         return (Vec::new(), Child { first, count: count as u32 });
     };
-    let boxes = [bounds(&primitives[..middle]), bounds(&primitives[middle..])];
     let (left, right) = primitives.split_at_mut(middle);
-    let mut build_left = || subtree(left, first, depth + 1);
-    let mut build_right = || subtree(right, first + middle as u32, depth + 1);
-    let ((left_nodes, left), (right_nodes, right)) =
-        if count >= PARALLEL_FROM { rayon::join(build_left, build_right) } else { (build_left(), build_right()) };
+    let (boxes, ((left_nodes, left), (right_nodes, right))) = {
+        let build = |half: &mut [Primitive], first: u32| {
+            let all = bounds(half);
+            (all, subtree(half, &all, first, depth + 1))
+        };
+        let (left, right) = rayon::join(|| build(left, first), || build(right, first + middle as u32));
+        ([left.0, right.0], (left.1, right.1))
+    };
 
     let left_at = 1;
     let right_at = left_at + left_nodes.len() as u32;
     let mut nodes = Vec::with_capacity(1 + left_nodes.len() + right_nodes.len());
-    nodes.push(Node {
-        min: std::array::from_fn(|axis| [boxes[0].min[axis], boxes[1].min[axis]]),
-        max: std::array::from_fn(|axis| [boxes[0].max[axis], boxes[1].max[axis]]),
-        children: [moved(left, left_at), moved(right, right_at)],
-    });
+    nodes.push(Node::new(&boxes, [moved(left, left_at), moved(right, right_at)]));
     for (part, at) in [(left_nodes, left_at), (right_nodes, right_at)] {
         nodes.extend(part.into_iter().map(|node| Node { children: node.children.map(|c| moved(c, at)), ..node }));
     }
     (nodes, Child { first: 0, count: 0 })
+}
+
+/// Like [`subtree`] by one thread, which puts the inner nodes where they stay: behind those of `nodes`.
+fn grow(primitives: &mut [Primitive], all: &Box3, first: u32, depth: usize, nodes: &mut Vec<Node>) -> Child {
+    let Some(middle) = split(primitives, all, depth) else {
+        return Child { first, count: primitives.len() as u32 };
+    };
+    let (left, right) = primitives.split_at_mut(middle);
+    let boxes = [bounds(left), bounds(right)];
+    let at = nodes.len();
+    // The children are known when they are built; they follow their parent.
+    nodes.push(Node::new(&boxes, [Child::default(); 2]));
+    let left = grow(left, &boxes[0], first, depth + 1, nodes);
+    let right = grow(right, &boxes[1], first + middle as u32, depth + 1, nodes);
+    nodes[at].children = [left, right];
+    Child { first: at as u32, count: 0 }
+}
+
+impl Node {
+    fn new(boxes: &[Box3; 2], children: [Child; 2]) -> Self {
+        Self {
+            min: std::array::from_fn(|axis| [boxes[0].min[axis], boxes[1].min[axis]]),
+            max: std::array::from_fn(|axis| [boxes[0].max[axis], boxes[1].max[axis]]),
+            children,
+        }
+    }
 }
 
 /// A child whose inner nodes were moved by `offset`.
@@ -136,16 +174,19 @@ fn bounds(primitives: &[Primitive]) -> Box3 {
 }
 
 /// Reorders `primitives` into two halves and returns where the second begins; `None` where one leaf is cheaper.
-fn split(primitives: &mut [Primitive], depth: usize) -> Option<usize> {
-    let count = primitives.len();
-    if count <= 1 {
-        return None;
+fn split(primitives: &mut [Primitive], all: &Box3, depth: usize) -> Option<usize> {
+    match primitives.len() {
+        0..=MIN_LEAF => None,
+        0..=FEW => split_by_bins::<FEW_BINS>(primitives, all, depth),
+        _ => split_by_bins::<BINS>(primitives, all, depth),
     }
+}
+
+fn split_by_bins<const BINS: usize>(primitives: &mut [Primitive], all: &Box3, depth: usize) -> Option<usize> {
+    let count = primitives.len();
     let mut low = [f32::INFINITY; 3];
     let mut high = [f32::NEG_INFINITY; 3];
-    let mut all = Box3::EMPTY;
     for p in primitives.iter() {
-        all.add(&p.bounds);
         for axis in 0..3 {
             low[axis] = low[axis].min(p.centre2(axis));
             high[axis] = high[axis].max(p.centre2(axis));
@@ -158,7 +199,7 @@ fn split(primitives: &mut [Primitive], depth: usize) -> Option<usize> {
     });
     let bin_of = |p: &Primitive, axis: usize| (((p.centre2(axis) - low[axis]) * scale[axis]) as usize).min(BINS - 1);
 
-    let best = if depth >= COUNT_SPLIT_FROM { None } else { best_bin(primitives, &all, &scale, bin_of) };
+    let best = if depth >= COUNT_SPLIT_FROM { None } else { best_bin::<BINS>(primitives, all, &scale, bin_of) };
     match best {
         Some((cost, axis, bin)) if count > MAX_LEAF || cost < count as f32 => {
             Some(partition(primitives, |p| bin_of(p, axis) < bin))
@@ -179,7 +220,7 @@ fn split(primitives: &mut [Primitive], depth: usize) -> Option<usize> {
 }
 
 /// The cheapest border between bins over the three axes: cost, axis, and the first bin of the second half.
-fn best_bin(
+fn best_bin<const BINS: usize>(
     primitives: &[Primitive],
     all: &Box3,
     scale: &[f32; 3],
