@@ -164,11 +164,11 @@ fn a_server_without_ranges_sends_the_archive_once() {
     fetch(&server, dir.path(), &["aston"]).unwrap();
     let kept = dir.path().join("set.zip");
     assert_eq!(std::fs::read(&kept).unwrap(), archive);
-    let sent = server.sent();
+    // The second run needs no more than the head of an answer. What the server puts into its socket does not tell: the kernel
+    // takes megabytes before anyone reads.
+    server.misbehave(Faults { ignores_ranges: true, mute: true, ..Faults::default() });
     let summary = fetch(&server, dir.path(), &["mesh"]).unwrap();
     assert_eq!((summary.files_written, summary.files_kept), (2, 1));
-    // The second run needs no more than the head of an answer (what the sockets hold of it).
-    assert!(server.sent() - sent < archive.len() as u64, "{} bytes more", server.sent() - sent);
     // The archive itself can be named as the source.
     let again = tempfile::tempdir().unwrap();
     download(again.path(), &options(kept.to_str().unwrap(), &["bridge"]), &Silent).unwrap();

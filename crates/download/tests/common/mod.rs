@@ -35,6 +35,7 @@ pub struct TestServer {
     pub url: String,
     /// Bytes of bodies sent.
     sent: Arc<AtomicU64>,
+    state: Arc<(Vec<u8>, Mutex<Faults>)>,
 }
 
 impl TestServer {
@@ -44,16 +45,22 @@ impl TestServer {
         let (sent, requests) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicUsize::new(0)));
         let state = Arc::new((file, Mutex::new(faults)));
         let counters = (sent.clone(), requests);
+        let shared = state.clone();
         std::thread::spawn(move || {
             for stream in listener.incoming().flatten() {
-                let (state, counters) = (state.clone(), counters.clone());
+                let (state, counters) = (shared.clone(), counters.clone());
                 std::thread::spawn(move || {
                     // A connection that the other side closes is no fault of the server.
                     let _ = serve(stream, &state.0, &state.1, &counters);
                 });
             }
         });
-        Self { url, sent }
+        Self { url, sent, state }
+    }
+
+    /// From the next request on.
+    pub fn misbehave(&self, faults: Faults) {
+        *self.state.1.lock().unwrap() = faults;
     }
 
     pub fn sent(&self) -> u64 {
