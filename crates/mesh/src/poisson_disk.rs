@@ -54,21 +54,35 @@ fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64
         point.weight = weight;
     }
 
-    let mut queue = Queue::new(&grid.points);
-    let mut kept = vec![true; count];
-    for _ in n..count {
-        let Some(i) = queue.pop_most_crowded(&grid.points) else { break };
-        kept[i as usize] = false;
-        let gone = grid.points[i as usize];
-        for run in grid.runs_around(i as usize) {
-            for p in &mut grid.points[run] {
-                p.weight -= p.crowding(&gone, floor);
-            }
+    let mut surplus = count.saturating_sub(n);
+    // Few are removed in the order of the whole surface, which jumps through memory.
+    while surplus > count / SHARE_IN_ORDER {
+        // No more points than the surplus are more crowded than this, and removals only make it fewer.
+        let Some(limit) = nth_largest_weight(&grid.points, surplus) else { break };
+        let removed = grid.remove_above(limit, floor);
+        if removed == 0 {
+            break;
         }
+        surplus -= removed;
     }
-    let mut survivors: Vec<u32> = order.into_iter().zip(kept).filter(|(_, kept)| *kept).map(|(i, _)| i).collect();
+    let mut queue = Queue::new(&grid.points);
+    for _ in 0..surplus {
+        let Some(i) = queue.pop_most_crowded(&grid.points) else { break };
+        grid.remove(i as usize, floor);
+    }
+    let mut survivors: Vec<u32> =
+        order.into_iter().zip(&grid.points).filter(|(_, point)| !point.is_removed()).map(|(i, _)| i).collect();
     survivors.sort_unstable();
     survivors.into_iter().map(|i| candidates[i as usize]).collect()
+}
+
+/// The share (one in so many) of points that are removed in the order of the whole surface.
+const SHARE_IN_ORDER: usize = 64;
+
+/// The weight that exactly `n` points exceed, where no two are equal. `None` where fewer are left.
+fn nth_largest_weight(points: &[Candidate], n: usize) -> Option<f64> {
+    let mut weights: Vec<f64> = points.iter().filter(|p| !p.is_removed()).map(|p| p.weight).collect();
+    (n < weights.len()).then(|| *weights.select_nth_unstable_by(n, |a, b| b.total_cmp(a)).1)
 }
 
 /// Points by crowding, the most crowded first.
@@ -93,7 +107,7 @@ impl Queue {
             step: (most / count as f64).max(f64::MIN_POSITIVE),
             heap: Vec::new(),
         };
-        for (i, point) in points.iter().enumerate() {
+        for (i, point) in points.iter().enumerate().filter(|(_, point)| !point.is_removed()) {
             let bucket = queue.bucket_of(point.weight);
             queue.buckets[bucket].push(i as u32);
         }
@@ -161,10 +175,15 @@ fn sift_down(heap: &mut [(f64, u32)], mut i: usize) {
 #[derive(Clone, Copy)]
 struct Candidate {
     at: [f64; 3],
+    /// Minus infinity once it is removed.
     weight: f64,
 }
 
 impl Candidate {
+    fn is_removed(&self) -> bool {
+        self.weight == f64::NEG_INFINITY
+    }
+
     /// How much two points crowd each other.
     #[inline]
     fn crowding(&self, other: &Candidate, floor: f64) -> f64 {
@@ -245,6 +264,58 @@ impl Grid {
         let points =
             order.iter().map(|&i| Candidate { at: in_reaches(&points[i as usize]).into(), weight: 0.0 }).collect();
         (order, Self { points, cell_of_point, runs })
+    }
+
+    /// Takes a point away; those around it are less crowded.
+    fn remove(&mut self, i: usize, floor: f64) {
+        let gone = self.points[i];
+        for run in self.runs_around(i) {
+            for p in &mut self.points[run] {
+                p.weight -= p.crowding(&gone, floor);
+            }
+        }
+        self.points[i].weight = f64::NEG_INFINITY;
+    }
+
+    /// Removes the most crowded point until none is above `limit`; returns how many went.
+    ///
+    /// The result is that of removing them in the order of their weights. Weights only ever fall, and fall only where a
+    /// neighbour goes; so a point with no more crowded neighbour goes before all of them, whatever happens elsewhere. The
+    /// points are visited where they lie, and each waits for its more crowded neighbours: all is near in memory.
+    fn remove_above(&mut self, limit: f64, floor: f64) -> usize {
+        let mut removed = 0;
+        let mut waiting = Vec::new();
+        for start in 0..self.points.len() {
+            waiting.push(start);
+            while let Some(&i) = waiting.last() {
+                if self.points[i].weight <= limit {
+                    waiting.pop();
+                } else if let Some(first) = self.most_crowded_around(i) {
+                    waiting.push(first);
+                } else {
+                    self.remove(i, floor);
+                    removed += 1;
+                    waiting.pop();
+                }
+            }
+        }
+        removed
+    }
+
+    /// The most crowded neighbour of point `i`, if it is more crowded than the point. Of equal ones the lowest number counts
+    /// as more crowded.
+    fn most_crowded_around(&self, i: usize) -> Option<usize> {
+        let point = self.points[i];
+        let mut most = (point.weight, i);
+        for run in self.runs_around(i) {
+            let first = run.start;
+            for (at, p) in self.points[run].iter().enumerate() {
+                if p.weight >= most.0 && (p.weight > most.0 || first + at < most.1) && p.crowding(&point, 0.0) > 0.0 {
+                    most = (p.weight, first + at);
+                }
+            }
+        }
+        (most.1 != i).then_some(most.1)
     }
 
     /// The runs of points around point `i`, itself included.
