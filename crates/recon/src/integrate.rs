@@ -25,52 +25,71 @@ fn is_depth(z: f32) -> bool {
     z > 0.0 && z.is_finite()
 }
 
-/// Pixels along each side of a tile of [`FarthestDepth`].
-const TILE: usize = 16;
+/// Pixels along each side of a tile of [`DepthTiles`].
+const TILE: usize = 8;
 
-/// The largest depth in each tile of a depth map, 0 where a tile has no depth.
-pub(crate) struct FarthestDepth {
+/// The range of depths in each tile of a depth map, row by row.
+pub(crate) struct DepthTiles {
     columns: usize,
-    tiles: Vec<f32>,
+    tiles: Vec<DepthRange>,
 }
 
-impl FarthestDepth {
+/// From the nearest to the farthest depth; `far` is 0 where there is none.
+#[derive(Clone, Copy)]
+struct DepthRange {
+    near: f32,
+    far: f32,
+}
+
+impl DepthRange {
+    const NONE: Self = Self { near: f32::INFINITY, far: 0.0 };
+}
+
+impl DepthTiles {
     pub fn of(depth: &DepthImage) -> Self {
         let columns = depth.width().div_ceil(TILE);
-        let mut tiles = vec![0.0; columns * depth.height().div_ceil(TILE)];
+        let mut tiles = vec![DepthRange::NONE; columns * depth.height().div_ceil(TILE)];
         if columns > 0 {
             let bands = depth.data().par_chunks(TILE * depth.width());
-            tiles.par_chunks_mut(columns).zip(bands).for_each(|(tiles, band)| {
-                farthest_in_band(tiles, band, depth.width());
-            });
+            tiles.par_chunks_mut(columns).zip(bands).with_min_len(8).for_each_init(
+                || (vec![0.0; depth.width()], vec![0.0; depth.width()]),
+                |(near, far), (tiles, band)| ranges_in_band(tiles, band, near, far),
+            );
         }
         Self { columns, tiles }
     }
+
+    fn farthest(&self) -> f32 {
+        self.tiles.iter().map(|tile| tile.far).fold(0.0, f32::max)
+    }
 }
 
-/// The largest depth of each tile of a band of rows.
+/// The depths of each tile of a band of rows; `near` and `far` are room for one row.
 #[multiversion(targets("x86_64+avx2"))]
-fn farthest_in_band(tiles: &mut [f32], band: &[f32], width: usize) {
-    let mut most = [0.0f32; TILE];
-    for (index, tile) in tiles.iter_mut().enumerate() {
-        most.fill(0.0);
-        for row in band.chunks_exact(width) {
-            let pixels = &row[index * TILE..width.min((index + 1) * TILE)];
-            for (most, &z) in most.iter_mut().zip(pixels) {
-                *most = if z > *most { z } else { *most };
-            }
+fn ranges_in_band(tiles: &mut [DepthRange], band: &[f32], near: &mut [f32], far: &mut [f32]) {
+    near.fill(f32::INFINITY);
+    far.fill(0.0);
+    // Rows from end to end, as memory likes it.
+    for row in band.chunks_exact(far.len()) {
+        for ((near, far), &z) in near.iter_mut().zip(far.iter_mut()).zip(row) {
+            // Both are also false for NaN.
+            *far = far.max(if z < f32::INFINITY { z } else { 0.0 });
+            *near = near.min(if z > 0.0 { z } else { f32::INFINITY });
         }
-        *tile = most.iter().fold(0.0, |a, &b| if b > a { b } else { a });
+    }
+    for (tile, (near, far)) in tiles.iter_mut().zip(near.chunks(TILE).zip(far.chunks(TILE))) {
+        tile.near = near.iter().fold(f32::INFINITY, |a, &b| if b < a { b } else { a });
+        tile.far = far.iter().fold(0.0, |a, &b| if b > a { b } else { a });
     }
 }
 
 /// The blocks that hold any point within `truncation_m` (along z) of what the depth map shows, in ascending order.
 ///
-/// Pixels are visited at a stride whose footprint is at most one voxel, and each stands for those up to the next: the
-/// stretch of its ray is grown sideways by the stride.
+/// Where depth changes little, a tile of pixels is taken as one thick ray. Elsewhere pixels are visited at a stride whose
+/// footprint is at most one voxel, and each stands for those around it.
 pub(crate) fn touched_blocks(
     view: &FrameView,
-    farthest: &FarthestDepth,
+    tiles: &DepthTiles,
     voxel_size_m: f64,
     truncation_m: f64,
     limit: usize,
@@ -78,62 +97,45 @@ pub(crate) fn touched_blocks(
     let size = view.depth.size();
     let world_from_cam = view.cam_from_world.inverse();
     let focal = view.intrinsics.fx.min(view.intrinsics.fy);
-    let farthest_of_all = farthest.tiles.iter().copied().filter(|&z| is_depth(z)).fold(0.0, f32::max);
-    let stride = ((voxel_size_m * focal / f64::from(farthest_of_all)) as usize).clamp(1, SIDE);
+    let stride = ((voxel_size_m * focal / f64::from(tiles.farthest())) as usize).clamp(1, TILE);
     let block_size = voxel_size_m * SIDE as f64;
 
-    // In blocks: a point at depth z on the ray of pixel (x, y) is origin + z * (first + x * across).
+    // In blocks: a point at depth z on the ray of pixel (x, y) is origin + z * (first + x * across + y * down).
     let in_blocks = |v: Vector3<f64>| world_from_cam.rotate(&v) / block_size;
-    let origin = world_from_cam.translation() / block_size;
-    let across = in_blocks(Vector3::new(1.0 / view.intrinsics.fx, 0.0, 0.0));
-
-    let mark_row = |y: usize, found: &mut FoundBlocks| -> Result<()> {
-        let first = in_blocks(view.intrinsics.cam_from_img(&Point2::new(0.0, y as f64), 1.0).coords);
-        // The blocks along the previous ray: neighbouring rays mostly touch the same.
-        let mut previous = None;
-        for (x, &z) in view.depth.row(y).iter().enumerate().step_by(stride) {
-            if !is_depth(z) {
-                continue;
-            }
-            let z = f64::from(z);
-            let direction = first + across * x as f64;
-            let (near, far) = ((z - truncation_m).max(0.0), z + truncation_m);
-            let margin = stride as f64 * z / focal / block_size;
-            let start = origin + direction * near;
-            let end = origin + direction * far;
-            if !start.iter().chain(&end).all(|v| v.abs() + margin < MAX_BLOCK_COORD) {
-                return Err(Error::Failed(format!(
-                    "a surface lies {:.0} m from the origin, too far for voxels of {} mm; check the unit of the poses",
-                    end.norm() * block_size,
-                    voxel_size_m * 1e3
-                )));
-            }
-            let whole = BlockRange::around(&start, &end, margin);
-            // A single row of blocks is touched all along; in a wider range the pieces of the ray decide.
-            if whole.is_row() {
-                if previous != Some(whole) {
-                    found.add(whole)?;
-                }
-            } else {
-                let pieces = (2.0 * (far - near) * direction.norm()).ceil().max(1.0);
-                let mut start = start;
-                for i in 0..pieces as usize {
-                    let end = origin + direction * (near + (far - near) * (i + 1) as f64 / pieces);
-                    found.add(BlockRange::around(&start, &end, margin))?;
-                    start = end;
+    let rays = Rays {
+        origin: world_from_cam.translation() / block_size,
+        first: in_blocks(view.intrinsics.cam_from_img(&Point2::origin(), 1.0).coords),
+        across: in_blocks(Vector3::new(1.0 / view.intrinsics.fx, 0.0, 0.0)),
+        down: in_blocks(Vector3::new(0.0, 1.0 / view.intrinsics.fy, 0.0)),
+        truncation_m,
+    };
+    let mark_tile = |column: usize, row: usize, tile: DepthRange, found: &mut FoundBlocks| -> Result<()> {
+        let (near, far) = (f64::from(tile.near), f64::from(tile.far));
+        let corner = [column * TILE, row * TILE];
+        if far - near <= truncation_m {
+            let middle = corner.map(|v| v as f64 + (TILE - 1) as f64 / 2.0);
+            return rays.mark(middle, TILE as f64 / 2.0, near, far, found);
+        }
+        for y in (corner[1]..size.height.min(corner[1] + TILE)).step_by(stride) {
+            for x in (corner[0]..size.width.min(corner[0] + TILE)).step_by(stride) {
+                let z = view.depth[(x, y)];
+                if is_depth(z) {
+                    let z = f64::from(z);
+                    rays.mark([x as f64, y as f64], stride as f64, z, z, found)?;
                 }
             }
-            previous = Some(whole);
         }
         Ok(())
     };
-    let rows: Vec<usize> = (0..size.height).step_by(stride).collect();
-    let mark_rows = |rows: &[usize]| -> Result<Vec<[i32; 3]>> {
+    let mark_rows = |(band, rows): (usize, &[DepthRange])| -> Result<Vec<[i32; 3]>> {
         let mut found = FoundBlocks::new(limit, voxel_size_m);
-        rows.iter().try_for_each(|&y| mark_row(y, &mut found))?;
+        for (i, &tile) in rows.iter().enumerate().filter(|(_, tile)| tile.far > 0.0) {
+            mark_tile(i % tiles.columns, band * BAND + i / tiles.columns, tile, &mut found)?;
+        }
         Ok(found.into_sorted())
     };
-    let found: Vec<Vec<[i32; 3]>> = rows.par_chunks(16).map(mark_rows).collect::<Result<_>>()?;
+    let found: Vec<Vec<[i32; 3]>> =
+        tiles.tiles.par_chunks(BAND * tiles.columns.max(1)).enumerate().map(mark_rows).collect::<Result<_>>()?;
     let mut touched = found.concat();
     touched.sort_unstable();
     touched.dedup();
@@ -143,20 +145,63 @@ pub(crate) fn touched_blocks(
     Ok(touched)
 }
 
+/// Rows of tiles that are searched for blocks in one go.
+const BAND: usize = 8;
+
+/// The rays of an image's pixels, in blocks.
+struct Rays {
+    origin: Vector3<f64>,
+    /// Direction of pixel (0, 0) for a depth of 1 m, and what a pixel to the right and one below add to it.
+    first: Vector3<f64>,
+    across: Vector3<f64>,
+    down: Vector3<f64>,
+    truncation_m: f64,
+}
+
+impl Rays {
+    /// Adds the blocks along the ray of a pixel, `reach` pixels thick to each side, within the truncation of the depths from
+    /// `near` to `far`.
+    fn mark(&self, pixel: [f64; 2], reach: f64, near: f64, far: f64, found: &mut FoundBlocks) -> Result<()> {
+        let direction = self.first + self.across * pixel[0] + self.down * pixel[1];
+        let (near, far) = ((near - self.truncation_m).max(0.0), far + self.truncation_m);
+        let margin = (self.across.abs() + self.down.abs()) * (reach * far);
+        let start = self.origin + direction * near;
+        let end = self.origin + direction * far;
+        let within = |v: &Vector3<f64>| (v.abs() + margin).iter().all(|&v| v < MAX_BLOCK_COORD);
+        if !(within(&start) && within(&end)) {
+            return Err(found.too_far(&end));
+        }
+        let whole = BlockRange::around(&start, &end, &margin);
+        // A single row of blocks is touched all along; in a wider range the pieces of the ray decide.
+        if whole.is_row() {
+            return found.add(whole);
+        }
+        let pieces = (2.0 * (far - near) * direction.norm()).ceil().max(1.0);
+        let step = (end - start) / pieces;
+        let mut start = start;
+        for _ in 0..pieces as usize {
+            let end = start + step;
+            found.add(BlockRange::around(&start, &end, &margin))?;
+            start = end;
+        }
+        Ok(())
+    }
+}
+
 /// A box of blocks, both ends included.
-#[derive(Clone, Copy, PartialEq)]
+#[derive(Clone, Copy)]
 struct BlockRange {
     low: Vector3<i32>,
     high: Vector3<i32>,
 }
 
 impl BlockRange {
-    /// The blocks within `margin` of the box that two points span, all in blocks.
-    fn around(a: &Vector3<f64>, b: &Vector3<f64>, margin: f64) -> Self {
+    /// The blocks within `margin` (of each axis) of the box that two points span, all in blocks.
+    fn around(a: &Vector3<f64>, b: &Vector3<f64>, margin: &Vector3<f64>) -> Self {
         // Plain comparisons: these compile to single instructions, `f64::min` does not.
         let low = a.zip_map(b, |a, b| if a < b { a } else { b });
         let high = a.zip_map(b, |a, b| if a > b { a } else { b });
-        Self { low: low.map(|v| floor(v - margin)), high: high.map(|v| floor(v + margin)) }
+        Self { low: (low - margin).map(floor), high: (high + margin).map(floor) }
     }
 
     /// Whether the blocks lie in one line along an axis.
@@ -182,6 +227,14 @@ impl FoundBlocks {
     /// A list of at most `limit` blocks.
     fn new(limit: usize, voxel_size_m: f64) -> Self {
         Self { blocks: Vec::new(), recent: [[i32::MAX; 3]; 256], limit, voxel_size_m }
+    }
+
+    fn too_far(&self, at: &Vector3<f64>) -> Error {
+        Error::Failed(format!(
+            "a surface lies {:.0} m from the origin, too far for voxels of {} mm; check the unit of the poses",
+            at.norm() * self.voxel_size_m * SIDE as f64,
+            self.voxel_size_m * 1e3
+        ))
     }
 
     fn add(&mut self, range: BlockRange) -> Result<()> {
@@ -216,6 +269,17 @@ impl FoundBlocks {
     }
 }
 
+/// The largest integer not above `x`, from 0 to 2^22, twice. In arithmetic that becomes vectors; conversions do not.
+#[inline(always)]
+fn floor_pixel(x: f32) -> (f32, i32) {
+    // From 2^23 on, single precision holds integers only: adding rounds, and the last bits are the number.
+    const SHIFT: f32 = (1 << 23) as f32;
+    let shifted = x + SHIFT;
+    let rounded = shifted - SHIFT;
+    let number = (shifted.to_bits() ^ SHIFT.to_bits()) as i32;
+    if rounded > x { (rounded - 1.0, number.wrapping_sub(1)) } else { (rounded, number) }
+}
+
 /// The largest integer not above `x`, for `x` within [`MAX_BLOCK_COORD`]; the library's is a call on older processors.
 fn floor(x: f64) -> i32 {
     let cut = x as i32;
@@ -224,7 +288,7 @@ fn floor(x: f64) -> i32 {
 
 impl<'a> FrameView<'a> {
     /// Everything about the frame that a block's update needs, in single precision.
-    pub fn updater(&self, farthest: FarthestDepth, voxel_size_m: f64, truncation_m: f64) -> BlockUpdater<'a> {
+    pub fn updater(&self, tiles: DepthTiles, voxel_size_m: f64, truncation_m: f64) -> BlockUpdater<'a> {
         let size = self.depth.size();
         let color = self.color.map(|image| {
             let scale = |to: usize, from: usize| to as f32 / from as f32;
@@ -233,7 +297,7 @@ impl<'a> FrameView<'a> {
         let steps: Matrix3<f32> = (self.cam_from_world.rotation_matrix() * voxel_size_m).cast();
         BlockUpdater {
             depth: self.depth,
-            farthest,
+            tiles,
             color,
             focal: [self.intrinsics.fx as f32, self.intrinsics.fy as f32],
             center: [self.intrinsics.cx as f32, self.intrinsics.cy as f32],
@@ -251,7 +315,7 @@ impl<'a> FrameView<'a> {
 /// Averages one frame into blocks.
 pub(crate) struct BlockUpdater<'a> {
     depth: &'a DepthImage,
-    farthest: FarthestDepth,
+    tiles: DepthTiles,
     /// The photograph, and its pixels per depth pixel.
     color: Option<(&'a RgbImage, [f32; 2])>,
     focal: [f32; 2],
@@ -302,8 +366,8 @@ impl BlockUpdater<'_> {
         };
         let hidden_beyond = nearest - self.truncation_m;
         (top / TILE..=bottom / TILE).any(|row| {
-            let tiles = &self.farthest.tiles[row * self.farthest.columns..][left / TILE..=right / TILE];
-            tiles.iter().any(|&z| z > 0.0 && z >= hidden_beyond)
+            let tiles = &self.tiles.tiles[row * self.tiles.columns..][left / TILE..=right / TILE];
+            tiles.iter().any(|tile| tile.far > 0.0 && tile.far >= hidden_beyond)
         })
     }
 
@@ -348,9 +412,9 @@ fn update_block(frame: &BlockUpdater, block: &mut Block, corner: &Vector3<f32>) 
             // Also false where nothing is seen, which is far nearer than any voxel.
             let counts = ahead >= -frame.truncation_m;
             let ahead = if ahead < frame.truncation_m { ahead } else { frame.truncation_m };
-            let grown = weight[i] + 1.0;
-            share[i] = if counts { 1.0 / grown } else { 0.0 };
-            weight[i] = if counts { grown } else { weight[i] };
+            // Sums of nothing in place of branches: stores under a mask are slow on some processors.
+            weight[i] += if counts { 1.0 } else { 0.0 };
+            share[i] = if counts { 1.0 / weight[i] } else { 0.0 };
             let change = (ahead - distance[i]) * share[i];
             distance[i] += if counts { change } else { 0.0 };
         }
@@ -383,35 +447,38 @@ fn depth_at(depth: &DepthImage, jump_m: f32, (z, u, v): (&Layer, &Layer, &Layer)
     for i in 0..LAYER {
         // All false for NaN.
         let within = (z[i] > 0.0) & (u[i] >= -0.5) & (u[i] < right) & (v[i] >= -0.5) & (v[i] < bottom);
-        inside[i] = u32::from(within);
+        inside[i] = if within { 1 } else { 0 };
         any |= inside[i];
-        let (x, y) = (clamp(u[i], last_x) as i32, clamp(v[i], last_y) as i32);
-        (a[i], b[i]) = (u[i] - x as f32, v[i] - y as f32);
-        first[i] = y * width as i32 + x;
+        let ((x, column), (y, row)) = (floor_pixel(clamp(u[i], last_x)), floor_pixel(clamp(v[i], last_y)));
+        (a[i], b[i]) = (u[i] - x, v[i] - y);
+        first[i] = row.wrapping_mul(width as i32).wrapping_add(column);
     }
     if any == 0 {
         return false;
     }
     // An image of one column or row has no neighbours there.
-    let (next_x, next_y) = (usize::from(width > 1), if height > 1 { width } else { 0 });
-    let mut corners = [[0.0; LAYER]; 4];
+    let below = if height > 1 { width } else { 0 };
+    let (mut upper, mut lower) = ([[0.0; 2]; LAYER], [[0.0; 2]; LAYER]);
     for i in 0..LAYER {
-        let around = &data[first[i] as usize..][..=next_y + next_x];
-        (corners[0][i], corners[1][i]) = (around[0], around[next_x]);
-        (corners[2][i], corners[3][i]) = (around[next_y], around[next_y + next_x]);
+        let at = first[i] as usize;
+        if width > 1 {
+            upper[i].copy_from_slice(&data[at..][..2]);
+            lower[i].copy_from_slice(&data[at..][below..][..2]);
+        } else {
+            (upper[i], lower[i]) = ([data[at]; 2], [data[at + below]; 2]);
+        }
     }
-    let [p, q, r, s] = &corners;
     let min = |a: f32, b: f32| if a < b { a } else { b };
     let max = |a: f32, b: f32| if a > b { a } else { b };
     for i in 0..LAYER {
-        let low = min(min(p[i], q[i]), min(r[i], s[i]));
-        let high = max(max(p[i], q[i]), max(r[i], s[i]));
-        let over = p[i] + (q[i] - p[i]) * a[i];
-        let under = r[i] + (s[i] - r[i]) * a[i];
+        let ([p, q], [r, s]) = (upper[i], lower[i]);
+        let low = min(min(p, q), min(r, s));
+        let high = max(max(p, q), max(r, s));
+        let over = p + (q - p) * a[i];
+        let under = r + (s - r) * a[i];
         let smooth = over + (under - over) * b[i];
-        let upper = if a[i] < 0.5 { p[i] } else { q[i] };
-        let lower = if a[i] < 0.5 { r[i] } else { s[i] };
-        let nearest = if b[i] < 0.5 { upper } else { lower };
+        let nearest = [if a[i] < 0.5 { p } else { q }, if a[i] < 0.5 { r } else { s }];
+        let nearest = if b[i] < 0.5 { nearest[0] } else { nearest[1] };
         let found = if (low > 0.0) & (high - low < jump_m) { smooth } else { nearest };
         // Also false for NaN.
         let counts = (inside[i] != 0) & (found > 0.0) & (found < f32::INFINITY);

@@ -7,7 +7,7 @@ use mb_image::{DepthImage, RgbImage};
 use mb_job::{Error, Result};
 use rayon::prelude::*;
 
-use crate::integrate::{FarthestDepth, FrameView, touched_blocks};
+use crate::integrate::{DepthTiles, FrameView, touched_blocks};
 
 /// Voxels along each side of a block.
 pub(crate) const SIDE: usize = 8;
@@ -121,12 +121,12 @@ impl TsdfVolume {
         cam_from_world: &Rigid3<Camera, World>,
     ) -> Result<()> {
         let view = FrameView { depth, color: None, intrinsics, cam_from_world };
-        self.allocate_touched(&view, &FarthestDepth::of(depth))
+        self.allocate_touched(&view, &DepthTiles::of(depth))
     }
 
-    fn allocate_touched(&mut self, view: &FrameView, farthest: &FarthestDepth) -> Result<()> {
+    fn allocate_touched(&mut self, view: &FrameView, tiles: &DepthTiles) -> Result<()> {
         let limit = MAX_VOLUME_BYTES / self.bytes_per_block();
-        let touched = touched_blocks(view, farthest, self.voxel_size_m, self.truncation_m, limit)?;
+        let touched = touched_blocks(view, tiles, self.voxel_size_m, self.truncation_m, limit)?;
         let new: Vec<[i32; 3]> = touched.into_iter().filter(|coord| !self.index.contains_key(coord)).collect();
         if self.blocks.len() + new.len() > limit {
             return Err(too_large(self.voxel_size_m));
@@ -159,9 +159,9 @@ impl TsdfVolume {
             }
         }
         let view = FrameView { depth, color, intrinsics, cam_from_world };
-        let farthest = FarthestDepth::of(depth);
-        self.allocate_touched(&view, &farthest)?;
-        let updater = view.updater(farthest, self.voxel_size_m, self.truncation_m);
+        let tiles = DepthTiles::of(depth);
+        self.allocate_touched(&view, &tiles)?;
+        let updater = view.updater(tiles, self.voxel_size_m, self.truncation_m);
         self.blocks.par_chunks_mut(16).for_each(|blocks| updater.update(blocks));
         Ok(())
     }
