@@ -37,7 +37,7 @@ fn main() {
                 report.joints,
                 report.groups,
                 report.collisions.len(),
-                report.stable
+                report.stable.map_or("unknown", |stable| if stable { "yes" } else { "no" })
             );
         }
     }

@@ -3,7 +3,7 @@
 use mb_geometry::Aabb;
 use nalgebra::Vector3;
 
-use crate::connections::{Connection, Connections, connections_with};
+use crate::connections::{Connection, Connections, Sets, connections_with};
 use crate::flat::Shapes;
 use crate::model::Model;
 use crate::neighbors::{Neighbors, overlap};
@@ -91,6 +91,61 @@ pub(crate) fn build_order(boxes: &[Aabb], connections: &[Connection], ground: f6
     (order, buildable)
 }
 
+/// Sets of bricks that no order puts together: whatever studs of one direction are left open, the studs of the other
+/// directions still join all of the set, so that it cannot be taken apart anywhere. Each is ascending.
+///
+/// Bricks are rigid, and what goes on a stud travels along it. The last step of any assembly, of single bricks or of
+/// parts built by themselves, joins two sets of bricks by studs of one direction alone; sets that split at some
+/// direction are looked at further, in pieces.
+pub(crate) fn locked(bricks: usize, connections: &[Connection]) -> Vec<Vec<usize>> {
+    let mut found = vec![];
+    let mut sets = vec![((0..bricks).collect::<Vec<usize>>(), connections.iter().collect::<Vec<_>>())];
+    let mut place = vec![usize::MAX; bricks];
+    while let Some((members, studs)) = sets.pop() {
+        let mut directions: Vec<Vector3<f64>> = vec![];
+        for stud in &studs {
+            if directions.iter().all(|way| !along(stud, way)) {
+                directions.push(stud.axis_in_ldraw);
+            }
+        }
+        if directions.len() < 2 {
+            continue;
+        }
+        members.iter().enumerate().for_each(|(at, &brick)| place[brick] = at);
+        let split = directions.iter().find_map(|way| {
+            let mut pieces = Sets::new(members.len());
+            for stud in studs.iter().filter(|stud| !along(stud, way)) {
+                pieces.join(place[stud.stud_brick], place[stud.grip_brick]);
+            }
+            let pieces = pieces.groups();
+            (pieces.len() > 1).then_some(pieces)
+        });
+        let Some(pieces) = split else {
+            found.push(members);
+            continue;
+        };
+        let mut piece_of = vec![0; members.len()];
+        for (index, piece) in pieces.iter().enumerate() {
+            piece.iter().for_each(|&at| piece_of[at] = index);
+        }
+        let mut studs_of = vec![vec![]; pieces.len()];
+        for stud in studs {
+            let piece = piece_of[place[stud.stud_brick]];
+            if piece == piece_of[place[stud.grip_brick]] {
+                studs_of[piece].push(stud);
+            }
+        }
+        let bricks_of = |piece: Vec<usize>| piece.into_iter().map(|at| members[at]).collect();
+        sets.extend(pieces.into_iter().map(bricks_of).zip(studs_of));
+    }
+    found
+}
+
+/// Whether a stud points along a direction, to either side.
+fn along(stud: &Connection, way: &Vector3<f64>) -> bool {
+    stud.axis_in_ldraw.dot(way).abs() > 0.99
+}
+
 /// Whether a brick that travels `way` comes from a side on which no box bars its path.
 fn is_free(boxes: &[Aabb], placed: &[usize], brick: usize, way: &Vector3<f64>) -> bool {
     let axis = way.iamax();
@@ -110,4 +165,37 @@ fn is_free(boxes: &[Aabb], placed: &[usize], brick: usize, way: &Vector3<f64>) -
         };
         beside || behind
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn studs(joined: &[(usize, usize, Vector3<f64>)]) -> Vec<Connection> {
+        let stud = |&(stud_brick, grip_brick, axis_in_ldraw): &_| Connection {
+            stud_brick,
+            grip_brick,
+            foot_in_ldraw: nalgebra::Point3::origin(),
+            axis_in_ldraw,
+        };
+        joined.iter().map(stud).collect()
+    }
+
+    #[test]
+    fn bricks_are_locked_where_no_direction_takes_them_apart() {
+        let (up, side) = (-Vector3::y(), Vector3::x());
+        let found = |joined: &[(usize, usize, Vector3<f64>)]| locked(6, &studs(joined));
+        // A tower, and two bricks that hold each other in two directions.
+        assert!(found(&[(0, 1, up), (1, 2, up), (2, 3, up)]).is_empty());
+        assert_eq!(found(&[(0, 1, up), (0, 1, side), (1, 2, up)]), [[0, 1]]);
+        // Two towers of two, side on side: built by themselves, then pushed together.
+        assert!(found(&[(0, 1, up), (2, 3, up), (0, 2, side), (1, 3, side)]).is_empty());
+        // One more stud across holds them in both directions.
+        assert_eq!(
+            found(&[(0, 1, up), (2, 3, up), (0, 2, side), (1, 3, side), (1, 2, up), (0, 3, side)]),
+            [[0, 1, 2, 3]]
+        );
+        // Studs of opposite senses are one direction.
+        assert!(found(&[(0, 1, up), (1, 2, -up), (2, 0, up)]).is_empty());
+    }
 }

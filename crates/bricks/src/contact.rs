@@ -1,10 +1,13 @@
 //! Where two bricks touch without a stud or a joint: surfaces that meet, and faces that lie on each other.
 
+use std::collections::HashMap;
+
 use mb_mesh::Bvh;
 use nalgebra::{Point3, Vector3};
 
 use crate::convex_hull::convex_hull;
 use crate::flat::Shapes;
+use crate::ldraw::file::FileId;
 use crate::model::Model;
 use crate::neighbors::Neighbors;
 
@@ -13,22 +16,33 @@ const TOUCH_LDU: f64 = 0.5;
 /// Sine of the tilt up to which a face is level.
 const LEVEL: f64 = 0.02;
 
-/// Whether a corner of one brick comes near the surface of the other, or lies in the middle of its box.
-pub(crate) fn touch(model: &Model, shapes: &Shapes, neighbors: &Neighbors, a: usize, b: usize) -> bool {
-    [(a, b), (b, a)].into_iter().any(|(moving, fixed)| {
-        let bricks = [&model.instances()[moving], &model.instances()[fixed]];
-        let Some(fixed_from_ldraw) = bricks[1].ldraw_from_part.inverse() else { return false };
-        let fixed_from_moving = fixed_from_ldraw.then_inner(&bricks[0].ldraw_from_part);
-        let shape = shapes.get(bricks[1].part);
-        let near = neighbors.boxes[fixed].grown(TOUCH_LDU);
-        let corners = shapes.get(bricks[0].part).vertices.iter();
-        let close: Vec<Point3<f64>> = corners
-            .filter(|p| near.contains(&bricks[0].ldraw_from_part.apply(p)))
-            .map(|p| fixed_from_moving.apply(p))
-            .collect();
-        let bvh = (!close.is_empty()).then(|| Bvh::new(&shape.to_mesh()));
-        bvh.is_some_and(|bvh| close.iter().any(|p| bvh.closest_within(p, TOUCH_LDU).is_some()))
-    })
+/// Tells which bricks touch; keeps what it prepared of each part.
+pub(crate) struct Touching<'a> {
+    model: &'a Model,
+    shapes: &'a Shapes,
+    neighbors: &'a Neighbors,
+    surfaces: HashMap<FileId, Bvh>,
+}
+
+impl<'a> Touching<'a> {
+    pub fn new(model: &'a Model, shapes: &'a Shapes, neighbors: &'a Neighbors) -> Self {
+        Self { model, shapes, neighbors, surfaces: HashMap::new() }
+    }
+
+    /// Whether a corner of one brick comes near the surface of the other.
+    pub fn touch(&mut self, a: usize, b: usize) -> bool {
+        [(a, b), (b, a)].into_iter().any(|(moving, fixed)| {
+            let bricks = [moving, fixed].map(|brick| &self.model.instances()[brick]);
+            let Some(fixed_from_ldraw) = bricks[1].ldraw_from_part.inverse() else { return false };
+            let fixed_from_moving = fixed_from_ldraw.then_inner(&bricks[0].ldraw_from_part);
+            let near = self.neighbors.boxes[fixed].grown(TOUCH_LDU);
+            let corners = self.shapes.get(bricks[0].part).vertices.iter();
+            let mut close = corners.filter(|p| near.contains(&bricks[0].ldraw_from_part.apply(p)));
+            let shape = self.shapes.get(bricks[1].part);
+            let surface = self.surfaces.entry(bricks[1].part).or_insert_with(|| Bvh::new(&shape.to_mesh()));
+            close.any(|p| surface.closest_within(&fixed_from_moving.apply(p), TOUCH_LDU).is_some())
+        })
+    }
 }
 
 /// The corners of the patch on which a level underside of `upper` lies on a level top of `lower`; empty where none

@@ -6,14 +6,14 @@ use nalgebra::Point3;
 
 use crate::collisions::Collision;
 use crate::connections::{Connections, Sets};
-use crate::contact::{resting_patch, touch};
+use crate::contact::{Touching, resting_patch};
 use crate::flat::Shapes;
 use crate::joints::{Joint, Joints};
 use crate::model::Model;
 use crate::neighbors::Neighbors;
 
 /// Bricks whose boxes come this close may touch, LDraw units.
-const NEAR_LDU: f64 = 0.4;
+pub(crate) const NEAR_LDU: f64 = 0.4;
 
 /// A brick that lies on another.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,6 +34,11 @@ pub(crate) struct Links {
     pub unclear: BTreeSet<(usize, usize)>,
     /// For each brick, whether it has studs, is or could be held by one, or has a joint.
     pub covered: Vec<bool>,
+    /// For each brick, whether its part has round surfaces, joined or not.
+    pub is_round: Vec<bool>,
+    /// Pairs of bricks whose hold on each other is not known: joints, what is taken for one, overlaps between groups,
+    /// and bricks with a round part or without known joints that touch another without a stud between them.
+    pub doubtful: BTreeSet<(usize, usize)>,
     /// Between bricks of different groups, at least one of them without foot on the ground.
     pub rests: Vec<Rest>,
     /// Groups of bricks that hold together, largest first.
@@ -56,9 +61,10 @@ impl Links {
             (covered[joint.peg_brick], covered[joint.hole_brick]) = (true, true);
         }
         let near = neighbors.overlapping_pairs(-NEAR_LDU);
+        let mut touching = Touching::new(model, shapes, neighbors);
         let unknown = |&(a, b): &(usize, usize)| !covered[a] || !covered[b];
         let mut assumed: Vec<(usize, usize)> =
-            near.iter().copied().filter(unknown).filter(|&(a, b)| touch(model, shapes, neighbors, a, b)).collect();
+            near.iter().copied().filter(unknown).filter(|&(a, b)| touching.touch(a, b)).collect();
         let grouped = |assumed: &[(usize, usize)]| {
             let mut sets = Sets::new(covered.len());
             studs.studs.iter().for_each(|c| sets.join(c.stud_brick, c.grip_brick));
@@ -106,11 +112,21 @@ impl Links {
         }
         let hangs = |&(a, b): &(usize, usize)| {
             let apart = group_of[a] != group_of[b] && !(carried[group_of[a]] && carried[group_of[b]]);
-            apart && (is_round[a] || is_round[b]) && touch(model, shapes, neighbors, a, b)
+            apart && (is_round[a] || is_round[b]) && touching.touch(a, b)
         };
         assumed.extend(near.iter().copied().filter(hangs));
-        let (groups, ..) = grouped(&assumed);
-        Self { studs, joints, assumed, unclear, covered, rests, groups }
+        let (groups, group_of, _) = grouped(&assumed);
+        let pair = |a: usize, b: usize| (a.min(b), a.max(b));
+        let by_stud: BTreeSet<(usize, usize)> = studs.studs.iter().map(|c| pair(c.stud_brick, c.grip_brick)).collect();
+        let mut doubtful: BTreeSet<(usize, usize)> = assumed.iter().map(|&(a, b)| pair(a, b)).collect();
+        doubtful.extend(joints.iter().map(|joint| pair(joint.peg_brick, joint.hole_brick)));
+        doubtful.extend(overlaps.iter().filter(|c| group_of[c.a] != group_of[c.b]).map(|c| pair(c.a, c.b)));
+        for &(a, b) in near.iter().filter(|&&(a, b)| is_round[a] || is_round[b]) {
+            if !by_stud.contains(&pair(a, b)) && !doubtful.contains(&pair(a, b)) && touching.touch(a, b) {
+                doubtful.insert(pair(a, b));
+            }
+        }
+        Self { studs, joints, assumed, unclear, covered, is_round, doubtful, rests, groups }
     }
 
     /// The bodies that move as one: bricks with joints between them, whose friction is taken to hold, and those that

@@ -79,15 +79,15 @@ fn a_cantilever_tips_where_its_centre_of_mass_leaves_the_foot() {
     // A 1 x 1 foot under one end of a row: the ground cannot pull, so the longest beam that stands is short.
     let on_foot = |part: &str, x: f64| check(&[("3003", 1.0, 3, 1.0), (part, x, 4, 1.0)]);
     // Beam centre at 1.0: balanced; the centre of mass of both moves out with the beam.
-    assert!(on_foot("3034", 1.0).stable);
-    assert!(!on_foot("3832", 5.0).stable);
+    assert_eq!(on_foot("3034", 1.0).stable, Some(true));
+    assert_eq!(on_foot("3832", 5.0).stable, Some(false));
     // A counterweight brings it back.
     let balanced =
         check(&[("3003", 1.0, 3, 1.0), ("3832", 1.0, 4, 1.0), ("3003", 5.0, 7, 1.0), ("3003", -3.0, 7, 1.0)]);
-    assert!(balanced.stable, "{:?}", balanced.notes);
+    assert_eq!(balanced.stable, Some(true), "{:?}", balanced.notes);
     let one_sided =
         check(&[("3003", 1.0, 3, 1.0), ("3832", 1.0, 4, 1.0), ("3001", 4.0, 7, 1.0), ("3001", 4.0, 10, 1.0)]);
-    assert!(!one_sided.stable);
+    assert_eq!(one_sided.stable, Some(false));
 }
 
 #[test]
@@ -100,14 +100,14 @@ fn the_tipping_point_is_where_statics_puts_it() {
         let lines = [("60479", 6.0, 1, 0.5), ("60479", 6.0 + overhang, 2, 0.5)];
         let report = model(&lines).check(&options).unwrap();
         // Centre of both: 6 + overhang / 2 from the lower one's free end, which stands up to 12.
-        assert_eq!(report.stable, 6.0 + overhang / 2.0 <= 12.0, "{overhang}: {:?}", report.notes);
+        assert_eq!(report.stable, Some(6.0 + overhang / 2.0 <= 12.0), "{overhang}: {:?}", report.notes);
     }
     for extra in 0..4 {
         let far = 11.0 + f64::from(extra);
         let lines = [("60479", 6.0, 1, 0.5), ("60479", 17.0, 2, 0.5), ("3005", far + 10.5, 5, 0.5)];
         let report = model(&lines).check(&options).unwrap();
         // The third brick adds its weight outside: over the edge.
-        assert!(!report.stable, "{far}");
+        assert_eq!(report.stable, Some(false), "{far}");
     }
 }
 
@@ -129,10 +129,34 @@ fn loads_grow_with_the_lever_and_pull_bricks_apart() {
 #[test]
 fn loose_bricks_are_told() {
     let report = check(&[("3001", 2.0, 3, 1.0), ("3001", 2.0, 9, 1.0)]);
-    assert!(!report.connected && !report.stable);
+    assert_eq!((report.connected, report.stable), (false, Some(false)));
     assert_eq!(report.loose_parts, [1]);
     let side_by_side = check(&[("3001", 2.0, 3, 1.0), ("3001", 6.0, 3, 1.0)]);
-    assert!(!side_by_side.connected && side_by_side.stable);
+    assert_eq!((side_by_side.connected, side_by_side.stable), (false, Some(true)));
+}
+
+#[test]
+fn a_submodel_beside_the_rest_may_stand_on_another_ground() {
+    // A tower, and a pair of bricks as a submodel at a place, `bottom` plates high.
+    let beside = |x: i32, bottom: i32, extra: &str| {
+        let text = format!(
+            "0 FILE m.ldr\n1 4 0 -24 0 1 0 0 0 1 0 0 0 1 3001.dat\n1 4 0 -48 0 1 0 0 0 1 0 0 0 1 3001.dat\n\
+             1 1 {} {} 0 1 0 0 0 1 0 0 0 1 sign.ldr\n{extra}0 FILE sign.ldr\n\
+             1 16 0 -48 0 1 0 0 0 1 0 0 0 1 3001.dat\n1 16 0 -24 0 1 0 0 0 1 0 0 0 1 3001.dat\n",
+            20 * x,
+            -8 * bottom
+        );
+        let report = Model::from_text(&text, "m.mpd", None).unwrap().check(&CheckOptions::default()).unwrap();
+        (report.stable, report.loose_parts.len(), report.undecided_parts.len())
+    };
+    assert_eq!(beside(8, 0, ""), (Some(true), 0, 0));
+    assert_eq!(beside(8, 1, ""), (None, 0, 2));
+    // Over another brick it falls, and so does a brick that is no submodel, unless it was placed by eye.
+    assert_eq!(beside(0, 9, ""), (Some(false), 2, 0));
+    for (height, stable) in [(3, None), (5, Some(false)), (24, Some(false))] {
+        let brick = format!("1 4 0 {} 200 1 0 0 0 1 0 0 0 1 3001.dat\n", -24 - height);
+        assert_eq!(beside(8, 0, &brick).0, stable, "{height}");
+    }
 }
 
 #[test]
@@ -140,7 +164,7 @@ fn bricks_are_put_in_from_a_free_side() {
     // A roof over a tower with a brick inside: the brick must come before the roof.
     let report = check(&[("3001", 2.0, 9, 1.0), ("3003", 1.0, 6, 1.0), ("3001", 2.0, 3, 1.0)]);
     assert_eq!(report.build_order, [2, 1, 0]);
-    assert!(report.buildable);
+    assert_eq!(report.buildable, Some(true));
 }
 
 #[test]
@@ -148,8 +172,8 @@ fn the_castle_stands() {
     let report = demo_model().check(&CheckOptions::default()).unwrap();
     assert_eq!(report.collisions, []);
     assert!(report.connected, "{} groups, loose {:?}", report.groups, report.loose_parts);
-    assert!(report.stable, "{:?}", report.notes);
-    assert!(report.buildable);
+    assert_eq!(report.stable, Some(true), "{:?}", report.notes);
+    assert_eq!(report.buildable, Some(true));
     assert_eq!(report.covered_parts, report.parts);
     let mut order = report.build_order.clone();
     order.sort_unstable();
@@ -192,7 +216,7 @@ fn a_beam_on_one_stud_pulls_as_the_lever_says() {
         // On both sides of the tipping point.
         for (share, stands) in [(1.02, true), (0.98, false)] {
             let clutch_n = options.clutch_n * expected * share;
-            assert_eq!(load(&CheckOptions { clutch_n, ..options }).stable, stands, "{beam} at {share}");
+            assert_eq!(load(&CheckOptions { clutch_n, ..options }).stable, Some(stands), "{beam} at {share}");
         }
     }
 }
@@ -221,7 +245,7 @@ fn a_leaning_tower_falls_where_its_centre_of_mass_leaves_its_foot() {
         let middle = f64::from(count - 1) / 2.0;
         // At exactly 2 it balances on an edge; that is nobody's tower.
         if (middle - 2.0).abs() > 0.1 {
-            assert_eq!(model(&lines).check(&strong).unwrap().stable, middle < 2.0, "{count}");
+            assert_eq!(model(&lines).check(&strong).unwrap().stable, Some(middle < 2.0), "{count}");
         }
     }
 }
@@ -233,7 +257,7 @@ fn bricks_that_lie_on_others_are_judged_by_their_weight() {
     for (x, stays) in [(1.0, true), (1.9, true), (2.1, false), (2.9, false)] {
         let report = lying(x);
         assert!(!report.connected);
-        assert_eq!((report.stable, report.resting_parts == [1]), (stays, true), "{x}: {:?}", report.notes);
+        assert_eq!((report.stable, report.resting_parts == [1]), (Some(stays), true), "{x}: {:?}", report.notes);
     }
     // Its weight bears on what carries it: on the end of a beam it pulls the beam off its stud.
     let on_beam = |lines: &[(&'static str, f64, i32, f64)]| {

@@ -153,6 +153,27 @@ fn studio_files_are_read_and_bad_ones_refused() {
 }
 
 #[test]
+fn an_entry_whose_own_header_is_damaged_is_refused_with_advice() {
+    // The directory at the end is whole; the header before the entry's bytes is not.
+    let folder = tempfile::tempdir().unwrap();
+    let model = format!("0 Model\n1 4 {PLACED} 3001.dat\n");
+    let path = zip_of(&folder.path().join("model.io"), &[("readme.txt", b"hello"), ("model.ldr", model.as_bytes())]);
+    let mut bytes = std::fs::read(&path).unwrap();
+    let second = bytes.windows(4).skip(1).position(|w| w == b"PK\x03\x04").unwrap() + 1;
+    bytes[second] ^= 0xff;
+    std::fs::write(&path, &bytes).unwrap();
+    let message = Model::read(&path, None).unwrap_err().to_string();
+    assert!(message.contains("entry model.ldr") && message.contains("damaged"), "{message}");
+}
+
+#[test]
+fn a_line_of_ten_megabytes_is_refused_in_few_words() {
+    let text = format!("1 4 {PLACED} 3001.dat\n{}\n", "7".repeat(10 << 20));
+    let refusal = Model::from_text(&text, "model.ldr", None).unwrap_err().to_string();
+    assert!(refusal.contains("line 2") && refusal.contains("10485761 bytes") && refusal.len() < 500, "{refusal}");
+}
+
+#[test]
 fn libraries_are_found_as_folder_and_as_zip() {
     let folder = tempfile::tempdir().unwrap();
     let part = b"0 Part\n0 BFC CERTIFY CCW\n1 16 0 0 0 1 0 0 0 1 0 0 0 1 s\\piece.dat\n";

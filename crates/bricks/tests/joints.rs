@@ -88,33 +88,58 @@ fn kinds_of_joints_are_told_apart_and_do_not_collide() {
 
 #[test]
 fn parts_without_known_joints_are_named_and_do_no_harm() {
-    // A post that enters another brick without a hole for it.
-    let report = check((4.0, 20.0), (9.0, 8.0, false), [3.0, -6.0, 0.0], UPRIGHT);
+    // A post that enters another brick without a hole for it, and stands on the ground with it.
+    let report = check((4.0, 14.0), (9.0, 8.0, false), [3.0, -6.0, 0.0], UPRIGHT);
     assert_eq!((report.covered_parts, report.collisions.len()), (0, 0));
-    assert!(report.stable && report.connected);
+    assert_eq!((report.stable, report.connected), (Some(true), true), "{:?}", report.notes);
     assert_eq!(report.uncovered.iter().map(|part| part.count).sum::<usize>(), 2);
     assert!(report.notes.iter().any(|note| note.contains("2 of 2 parts have no known joint")), "{:?}", report.notes);
 }
 
 #[test]
+fn what_only_a_joint_could_hold_is_undecided() {
+    // A peg as long as a tower, far out of the middle of its hole: whether the hole grips it is not modelled.
+    let leaning = check((4.0, 200.0), (4.0, 8.0, true), [0.0, 0.0, 0.0], LYING);
+    // A post in the air beside another, which touches nothing.
+    let apart = check((4.0, 8.0), (9.0, 8.0, false), [40.0, -20.0, 0.0], UPRIGHT);
+    for report in [&leaning, &apart] {
+        assert_eq!((report.stable, report.buildable), (None, None), "{report:?}");
+        assert!(report.falling_parts.is_empty() && report.loose_parts.is_empty(), "{report:?}");
+        assert!(report.notes.iter().any(|note| note.contains("cannot be said")), "{:?}", report.notes);
+    }
+    assert_eq!(apart.undecided_parts, [1]);
+}
+
+#[test]
 fn official_models_make_sense() {
-    let Some(library) = mb_testdata::find("ldraw/parts.zip") else { return };
+    let (Some(library), Some(models)) = (mb_testdata::find("ldraw/parts.zip"), mb_testdata::find("ldraw/models"))
+    else {
+        return;
+    };
     let library = PartLibrary::open(library).unwrap();
-    // Model; share of covered parts and share of parts in collisions that are the least and the most.
-    for (name, covered, colliding) in [
-        ("1180-1-moon-buggy", 1.0, 0.1),
-        ("5920-1-island-racer", 0.9, 0.1),
-        ("21022-1-lincoln-memorial", 1.0, 0.0),
-        ("40448-1-vintage-car", 1.0, 0.06),
-    ] {
-        let Some(path) = mb_testdata::find(&format!("ldraw/models/{name}.mpd")) else { return };
-        let report = Model::read(path, Some(&library)).unwrap().check(&CheckOptions::default()).unwrap();
-        let parts = report.parts as f64;
-        assert!(report.covered_parts as f64 >= covered * parts, "{name}: {} covered", report.covered_parts);
-        assert!(report.collisions.len() as f64 <= colliding * parts, "{name}: {:?}", report.collisions);
-        assert!(report.stable, "{name}: {:?}", report.notes);
-        assert!(report.joints.bars > 0, "{name}: {:?}", report.joints);
+    let (mut stand, mut fall) = (vec![], vec![]);
+    let paths = std::fs::read_dir(models).unwrap().map(|entry| entry.unwrap().path());
+    for path in paths.filter(|path| path.extension().is_some_and(|ending| ending == "mpd")) {
+        let name = path.file_stem().unwrap().to_str().unwrap().to_owned();
+        let report = Model::read(&path, Some(&library)).unwrap().check(&CheckOptions::default()).unwrap();
+        // Real products stand and can be built; what the check does not understand it must not hold against them.
+        if report.stable == Some(false) {
+            fall.push(format!("{name}: {:?}", report.notes));
+            continue;
+        }
+        assert_ne!(report.buildable, Some(false), "{name}");
+        assert_eq!(report.stable.is_none(), !report.undecided_parts.is_empty(), "{name}");
+        // Overlaps that are left are flexible parts and inexact files: few.
+        assert!(report.collisions.len() as f64 <= 0.1 * report.parts as f64, "{name}: {}", report.collisions.len());
+        assert!(report.joints.bars > 0 || report.joints.others > 0, "{name}: {:?}", report.joints);
         let uncovered: usize = report.uncovered.iter().map(|part| part.count).sum();
         assert_eq!(uncovered + report.covered_parts, report.parts);
+        if report.stable == Some(true) {
+            stand.push(name);
+        }
+    }
+    assert!(fall.is_empty(), "{fall:#?}");
+    for name in ["1180-1-moon-buggy", "5920-1-island-racer", "21022-1-lincoln-memorial", "40448-1-vintage-car"] {
+        assert!(stand.iter().any(|other| other == name), "{name} stands, and so do {stand:?}");
     }
 }

@@ -15,7 +15,8 @@ fn a_batch_is_sound_varied_and_repeatable() {
     let mut styles = BTreeSet::new();
     for random in &batch {
         let report = random.model.check(&CheckOptions::default()).unwrap();
-        assert!(report.connected && report.stable && report.buildable && report.collisions.is_empty());
+        assert!(report.connected && report.collisions.is_empty());
+        assert_eq!((report.stable, report.buildable), (Some(true), Some(true)));
         assert!((25..=150).contains(&random.summary.parts));
         assert!(random.summary.size_mm.iter().all(|&mm| mm <= 250.0));
         assert!(random.summary.size_mm.iter().any(|&mm| mm >= 80.0));

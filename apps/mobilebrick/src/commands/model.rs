@@ -243,7 +243,11 @@ impl Check {
 
 /// The report in a few lines.
 fn describe(report: &CheckReport) -> String {
-    let yes = |fact: bool, word: &str| if fact { word.to_owned() } else { format!("not {word}") };
+    let answer = |fact: Option<bool>, yes, no, unknown| match fact {
+        Some(true) => yes,
+        Some(false) => no,
+        None => unknown,
+    };
     let joints = report.joints;
     let mut text = format!(
         "{} parts, joints known of {}: {} studs, {} bars and fingers, {} pins, {} balls, {} others\n",
@@ -251,9 +255,14 @@ fn describe(report: &CheckReport) -> String {
     );
     text += &format!(
         "{}, {}, {}, {} collisions, {} overlaps that may be joints\n",
-        yes(report.connected, "connected"),
-        yes(report.stable, "stable"),
-        yes(report.buildable, "buildable in order"),
+        if report.connected { "connected" } else { "not connected" },
+        answer(report.stable, "stands", "does not stand", "whether it stands cannot be said"),
+        answer(
+            report.buildable,
+            "can be built brick by brick",
+            "cannot be built",
+            "whether it can be built brick by brick cannot be said"
+        ),
         report.collisions.len(),
         report.unclear_overlaps.len()
     );

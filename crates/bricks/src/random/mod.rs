@@ -154,7 +154,7 @@ fn build_until_sound(options: &RandomOptions, parts: &PartSet, index: usize, fir
 }
 
 fn is_sound(report: &CheckReport) -> bool {
-    report.connected && report.stable && report.buildable && report.collisions.is_empty()
+    report.connected && report.stable == Some(true) && report.buildable == Some(true) && report.collisions.is_empty()
 }
 
 /// One attempt: colours, and a size that comes near the wanted number of bricks; `None` where it has not the size that
