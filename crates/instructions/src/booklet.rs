@@ -1,6 +1,7 @@
 //! From a model to a booklet: plan, measure, lay out, draw, write.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::path::Path;
 
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
@@ -8,7 +9,8 @@ use image::{ExtendedColorType, ImageEncoder as _};
 use mb_bricks::Model;
 use mb_geometry::ImageSize;
 use mb_job::{Error, InputError, Progress, Result, Steps, write_atomic};
-use mb_render::{LineArtOptions, RgbaImage, ShadeOptions, line_art, shade};
+use mb_mesh::TriangleMesh;
+use mb_render::{Drawing, DrawingOptions, RgbaImage, ShadeOptions, shade};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -17,13 +19,13 @@ use crate::layout::book;
 use crate::page::PictureId;
 use crate::plan::{PieceKind, Plan, section_title};
 use crate::sheet::{Sheets, Shot};
-use crate::views::{Look, frames};
+use crate::views::{Look, Shown, Sight};
 use crate::{html, pdf};
 
 /// Pixels of a millimetre on paper, in the pictures of steps (200 dots an inch) and of pieces (250).
 const STEP_PX: f64 = 200.0 / 25.4;
 const PIECE_PX: f64 = 250.0 / 25.4;
-/// Steps that are drawn at the same time: bounds the memory, whatever the thread count.
+/// Pictures of steps that wait to be encoded together: bounds the memory, whatever the thread count.
 const AT_ONCE: usize = 4;
 /// How far what was there before is faded.
 const FADE: f32 = 0.52;
@@ -116,11 +118,12 @@ pub fn booklet(model: &Model, plan: &Plan, form: Form, progress: &dyn Progress) 
     draw_steps(model, &art, plan, &sheets, progress, &mut pictures)?;
     if let (Some(cover), Some(back), Some(main)) = (cover, back, plan.main()) {
         let assembly = Assembly::of_section(model, &art, main);
+        let mesh = assembly.mesh(0..assembly.bricks());
         for (id, shot) in [(PictureId::Cover, cover), (PictureId::Back, back)] {
             if progress.stop_requested() {
                 return Err(Error::Stopped);
             }
-            pictures.insert(id, png(&portrait(&assembly, &shot))?);
+            pictures.insert(id, png(&portrait(&assembly, &mesh, &shot))?);
         }
     }
     let bytes = match form {
@@ -157,16 +160,14 @@ fn title(model: &Model, plan: &Plan) -> String {
 
 /// The whole model, as large as the cover allows.
 fn whole_shot(model: &Model, art: &PartArt, plan: &Plan, look: &Look) -> Shot {
-    let frame = plan.main().map(|main| {
-        let assembly = Assembly::of_section(model, art, main);
-        frames(&assembly, look)[assembly.bricks()]
-    });
-    let frame = frame.expect("asked for only where there is something to build");
+    let main = plan.main().expect("asked for only where there is something to build");
+    let assembly = Assembly::of_section(model, art, main);
+    let sight = Sight::new(*look, &assembly.bounds());
     // Room for the shadow on the ground.
-    let size_m = [frame.size_m[0] * 1.1, frame.size_m[1] * 1.06];
-    let frame = crate::views::Frame { size_m, ..frame };
-    let scale = (0..2).map(|i| COVER_MM[i] / frame.size_m[i].max(1e-9)).fold(LARGEST_COVER_SCALE, f64::min);
-    Shot { look: *look, frame, scale }
+    let frame = sight.frames(&assembly)[assembly.bricks()].grown([0.1, 0.06]);
+    let size = frame.size_m();
+    let scale = (0..2).map(|i| COVER_MM[i] / size[i].max(1e-9)).fold(LARGEST_COVER_SCALE, f64::min);
+    Shot { sight, frame, scale }
 }
 
 fn draw_pieces(
@@ -187,8 +188,7 @@ fn draw_pieces(
                     PieceKind::Part(part, color) => Assembly::of_part(model, art, part, color),
                     PieceKind::Submodel(section) => Assembly::of_section(model, art, &plan.sections[section]),
                 };
-                let bricks = assembly.bricks();
-                let picture = draw(&assembly, shot, bricks, bricks, 0.0, PIECE_PX);
+                let picture = whole(&assembly, shot, PIECE_PX);
                 counter.step()?;
                 Ok((PictureId::Piece(**kind), png(&picture)?))
             })
@@ -212,60 +212,102 @@ fn draw_steps(
     let counter = Steps::new(progress, "drawing steps", plan.order.len());
     for (index, section) in plan.sections.iter().enumerate() {
         let assembly = Assembly::of_section(model, art, section);
-        let mut ends = vec![0];
-        for step in &section.steps {
-            ends.push(ends[ends.len() - 1] + step.bricks().count());
-        }
-        let steps: Vec<usize> = (0..section.steps.len()).collect();
-        for chunk in steps.chunks(AT_ONCE) {
-            let drawn: Vec<Result<(PictureId, Vec<u8>)>> = chunk
-                .par_iter()
-                .map(|&step| {
-                    let shot = &sheets.steps[index][step];
-                    let picture = draw(&assembly, shot, ends[step + 1], ends[step], FADE, STEP_PX);
-                    counter.step()?;
-                    Ok((PictureId::Step(index, step), png(&picture)?))
-                })
-                .collect();
-            for one in drawn {
-                let (id, bytes) = one?;
-                pictures.insert(id, bytes);
+        let shots = &sheets.steps[index];
+        let mut picker = Picker { assembly: &assembly, shots, canvas: None, there: 0 };
+        let mut waiting = vec![];
+        for (step, content) in section.steps.iter().enumerate() {
+            waiting.push((PictureId::Step(index, step), picker.step(step, content.bricks().count())));
+            counter.step()?;
+            if waiting.len() == AT_ONCE || step + 1 == section.steps.len() {
+                let encoded: Vec<Result<_>> =
+                    std::mem::take(&mut waiting).par_iter().map(|(id, picture)| Ok((*id, png(picture)?))).collect();
+                for one in encoded {
+                    let (id, bytes) = one?;
+                    pictures.insert(id, bytes);
+                }
             }
         }
     }
     Ok(())
 }
 
-/// Draws the first `bricks` bricks; those before `new` are faded, the others have a band around them, unless `new` is 0 or
-/// all of them.
-fn draw(assembly: &Assembly, shot: &Shot, bricks: usize, new: usize, fade: f32, px_per_mm: f64) -> RgbaImage {
-    let highlight = new > 0 && new < bricks;
-    let looks = assembly.looks(bricks, if highlight { new } else { 0 }, fade, highlight);
-    let mesh = assembly.mesh_of(bricks);
-    let view = shot.look.view(&shot.frame, pixels(shot, px_per_mm), 1.0 / (shot.scale * px_per_mm));
-    let options = LineArtOptions {
+/// Draws the steps of a section one after the other.
+struct Picker<'a> {
+    assembly: &'a Assembly<'a>,
+    shots: &'a [Shot],
+    /// What is drawn so far from the present side, with room for all steps until the next turn; and its first pixel.
+    canvas: Option<(Drawing<Shown>, [i64; 2])>,
+    /// Bricks that are there.
+    there: usize,
+}
+
+impl Picker<'_> {
+    /// The picture of the next step, which adds `count` bricks: they have a band around them, what was there is faded.
+    fn step(&mut self, step: usize, count: usize) -> RgbaImage {
+        let shot = &self.shots[step];
+        let look = |shot: &Shot| shot.sight.look;
+        let turned = step == 0 || look(&self.shots[step - 1]) != look(shot);
+        if turned {
+            let until = (step..self.shots.len()).take_while(|&later| look(&self.shots[later]) == look(shot)).last();
+            let last = &self.shots[until.unwrap_or(step)];
+            let mut drawing = drawing(last, STEP_PX);
+            add(&mut drawing, self.assembly, 0..self.there, FADE, false);
+            self.canvas = Some((drawing, last.pixels(STEP_PX).0));
+        }
+        let (drawing, origin) = self.canvas.as_mut().expect("the first step turns");
+        for brick in (0..self.there).rev() {
+            // From the newest back to what has been faded.
+            if !drawing.set_look(brick as u32, self.assembly.look(brick, FADE, false)) {
+                break;
+            }
+        }
+        add(drawing, self.assembly, self.there..self.there + count, 0.0, self.there > 0);
+        self.there += count;
+        let (first, size) = shot.pixels(STEP_PX);
+        cropped(drawing.picture(), [first[0] - origin[0], first[1] - origin[1]], size)
+    }
+}
+
+/// A part of a picture; transparent where it reaches beyond.
+fn cropped(picture: &RgbaImage, first: [i64; 2], size: ImageSize) -> RgbaImage {
+    let at = |v: usize, first: i64| usize::try_from(v as i64 + first).unwrap_or(usize::MAX);
+    RgbaImage::from_fn(size, |x, y| picture.get(at(x, first[0]), at(y, first[1])).copied().unwrap_or_default())
+}
+
+fn drawing(shot: &Shot, px_per_mm: f64) -> Drawing<Shown> {
+    let options = DrawingOptions {
         samples: 3,
         line_px: LINE_MM * px_per_mm,
         highlight_px: BAND_MM * px_per_mm,
         highlight: HIGHLIGHT,
         jump: JUMP_M.max(2.5 / (shot.scale * px_per_mm)),
     };
-    line_art(&assembly.art(bricks, &mesh, &looks), &view, &options)
+    Drawing::new(&shot.view(px_per_mm), &options)
 }
 
-fn pixels(shot: &Shot, px_per_mm: f64) -> ImageSize {
-    let [w, h] = shot.size_mm().map(|v| (v * px_per_mm).round().clamp(1.0, 8000.0) as usize);
-    ImageSize::new(w, h)
+/// Adds bricks to a drawing, a few at a time: their surfaces together would be large.
+fn add(drawing: &mut Drawing<Shown>, assembly: &Assembly, bricks: Range<usize>, fade: f32, highlighted: bool) {
+    const FEW: usize = 32;
+    for from in bricks.clone().step_by(FEW) {
+        let some = from..(from + FEW).min(bricks.end);
+        let looks: Vec<_> = some.clone().map(|brick| assembly.look(brick, fade, highlighted)).collect();
+        drawing.add(&assembly.surface(some).art(&looks));
+    }
 }
 
-/// The model as on the box: lines and colours of the drawings, in daylight, on a ground that takes its shadow.
-fn portrait(assembly: &Assembly, shot: &Shot) -> RgbaImage {
-    let bricks = assembly.bricks();
-    let drawing = draw(assembly, shot, bricks, bricks, 0.0, STEP_PX);
-    let mut white = assembly.mesh_of(bricks);
-    white.triangle_colors = None;
-    let view = shot.look.view(&shot.frame, pixels(shot, STEP_PX), 1.0 / (shot.scale * STEP_PX));
-    let light = shade(&white, &view, &ShadeOptions { samples: 1, color: [255; 3], ..ShadeOptions::default() });
+/// All bricks, as they are.
+fn whole(assembly: &Assembly, shot: &Shot, px_per_mm: f64) -> RgbaImage {
+    let mut drawing = drawing(shot, px_per_mm);
+    add(&mut drawing, assembly, 0..assembly.bricks(), 0.0, false);
+    drawing.into_picture()
+}
+
+/// The model as on the box: lines and colours of the drawings, in daylight, on a ground that takes its shadow. `white`
+/// is its bare geometry.
+fn portrait(assembly: &Assembly, white: &TriangleMesh, shot: &Shot) -> RgbaImage {
+    let drawing = whole(assembly, shot, STEP_PX);
+    let options = ShadeOptions { samples: 1, color: [255; 3], ..ShadeOptions::default() };
+    let light = shade(white, &shot.view(STEP_PX), &options);
     let mut at = 0;
     drawing.map(|&[r, g, b, a]| {
         let [l, _, _, shadow] = light.data()[at];

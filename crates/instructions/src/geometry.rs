@@ -1,6 +1,7 @@
 //! Parts and sections as surfaces with lines, ready to be drawn.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 
 use mb_bricks::{Affine, Color, ColorCode, FileId, Model, PartShape, object_from_ldraw};
 use mb_geometry::Aabb;
@@ -79,153 +80,139 @@ fn corner_normals(shape: &PartShape) -> Vec<[Vector3<f32>; 3]> {
         .collect()
 }
 
-/// Bricks in building order, in a frame of their own: metres, y up.
-pub(crate) struct Assembly {
-    mesh: TriangleMesh,
+/// Bricks in building order, in a frame of their own: metres, y up. Surfaces are made when asked for.
+pub(crate) struct Assembly<'a> {
+    model: &'a Model,
+    art: &'a PartArt,
+    bricks: Vec<Placed>,
+}
+
+/// A part where it stands.
+struct Placed {
+    part: FileId,
+    color: ColorCode,
+    frame_from_part: Affine,
+    inverted: bool,
+}
+
+/// The surface of some bricks of an assembly; its parts are numbered from 0.
+pub(crate) struct Surface {
+    pub mesh: TriangleMesh,
     normals: Vec<[Vector3<f32>; 3]>,
     opacity: Vec<u8>,
     edges: Vec<SharpEdge>,
-    lines: Vec<[u8; 3]>,
-    /// Where each brick ends among vertices, triangles and edges.
-    ends: Vec<[usize; 3]>,
 }
 
-impl Assembly {
-    fn empty() -> Self {
-        let mesh =
-            TriangleMesh { triangle_colors: Some(vec![]), triangle_parts: Some(vec![]), ..TriangleMesh::default() };
-        Self { mesh, normals: vec![], opacity: vec![], edges: vec![], lines: vec![], ends: vec![] }
+impl Surface {
+    pub fn art<'a>(&'a self, looks: &'a [Look]) -> LineArt<'a> {
+        LineArt { mesh: &self.mesh, corner_normals: &self.normals, opacity: &self.opacity, edges: &self.edges, looks }
     }
+}
 
+impl<'a> Assembly<'a> {
     /// A single part in a colour, in its own frame.
-    pub fn of_part(model: &Model, art: &PartArt, part: FileId, color: ColorCode) -> Self {
-        let mut assembly = Self::empty();
-        assembly.add(model, art, part, color, &Affine::identity(), false);
-        assembly
+    pub fn of_part(model: &'a Model, art: &'a PartArt, part: FileId, color: ColorCode) -> Self {
+        let placed = Placed { part, color, frame_from_part: Affine::identity(), inverted: false };
+        Self { model, art, bricks: vec![placed] }
     }
 
     /// All bricks of a section, step after step, in the frame of its file.
-    pub fn of_section(model: &Model, art: &PartArt, section: &Section) -> Self {
-        let mut assembly = Self::empty();
+    pub fn of_section(model: &'a Model, art: &'a PartArt, section: &Section) -> Self {
         let occurrence = &model.occurrences()[section.occurrence];
         let file_from_ldraw = occurrence.ldraw_from_file.inverse().unwrap_or_else(Affine::identity);
-        for brick in section.steps.iter().flat_map(|step| step.bricks()) {
+        let placed = |brick: usize| {
             let brick = &model.instances()[brick];
-            let file_from_part = file_from_ldraw.then_inner(&brick.ldraw_from_part);
-            assembly.add(model, art, brick.part, brick.color, &file_from_part, brick.inverted);
-        }
-        assembly
-    }
-
-    fn add(&mut self, model: &Model, art: &PartArt, part: FileId, color: ColorCode, place: &Affine, inverted: bool) {
-        let SmoothShape { shape, normals } = &art.of_part[&part];
-        let index = self.ends.len() as u32;
-        let base = self.mesh.vertices.len() as u32;
-        let placed = |p: &Point3<f64>| object_from_ldraw(&place.apply(p));
-        self.mesh.vertices.extend(shape.vertices.iter().map(placed));
-        let flip = inverted ^ place.is_mirrored();
-        let oriented = |[a, b, c]: [u32; 3]| if flip { [a, c, b] } else { [a, b, c] };
-        self.mesh.triangles.extend(shape.triangles.iter().map(|t| oriented(t.map(|v| base + v))));
-        // Normals turn with the inverse transposed; the change of axes is a half turn.
-        let turn: Matrix3<f64> = place.linear.try_inverse().map_or_else(Matrix3::identity, |m| m.transpose());
-        let turned = |n: &Vector3<f32>| {
-            let n = turn * n.cast::<f64>();
-            Vector3::new(n.x, -n.y, -n.z).try_normalize(0.0).unwrap_or_else(Vector3::y).cast()
+            let frame_from_part = file_from_ldraw.then_inner(&brick.ldraw_from_part);
+            Placed { part: brick.part, color: brick.color, frame_from_part, inverted: brick.inverted }
         };
-        self.normals.extend(normals.iter().map(|n| {
-            let [a, b, c] = [turned(&n[0]), turned(&n[1]), turned(&n[2])];
-            oriented_normals(flip, [a, b, c])
-        }));
-        let own = model.colors().look(color);
-        let mut known: Vec<(ColorCode, Color)> = vec![];
-        for &code in &shape.colors {
-            let at = known.iter().position(|(other, _)| *other == code).unwrap_or_else(|| {
-                known.push((code, surface(model, code, &own)));
-                known.len() - 1
-            });
-            let look = &known[at].1;
-            self.mesh.triangle_colors.get_or_insert_default().push(look.rgb);
-            self.opacity.push(if look.alpha == 255 { 255 } else { look.alpha.clamp(90, 200) });
-        }
-        self.mesh.triangle_parts.get_or_insert_default().resize(self.mesh.triangles.len(), index);
-        self.edges
-            .extend(shape.edges.iter().map(|edge| SharpEdge { ends: edge.ends.map(|p| placed(&p)), part: index }));
-        self.lines.push(line_rgb(own.rgb));
-        self.ends.push([self.mesh.vertices.len(), self.mesh.triangles.len(), self.edges.len()]);
+        let bricks = section.steps.iter().flat_map(|step| step.bricks()).map(placed).collect();
+        Self { model, art, bricks }
     }
 
     /// How many bricks there are.
     pub fn bricks(&self) -> usize {
-        self.ends.len()
+        self.bricks.len()
     }
 
-    /// The first `bricks` bricks; `mesh` is theirs, as [`Assembly::mesh_of`] gives it.
-    pub fn art<'a>(&'a self, bricks: usize, mesh: &'a TriangleMesh, looks: &'a [Look]) -> LineArt<'a> {
-        let [_, triangles, edges] = self.end(bricks);
-        LineArt {
-            mesh,
-            corner_normals: &self.normals[..triangles],
-            opacity: &self.opacity[..triangles],
-            edges: &self.edges[..edges],
-            looks,
+    /// The places of a brick's vertices.
+    pub fn vertices(&self, brick: usize) -> impl Iterator<Item = Point3<f64>> {
+        let Placed { part, frame_from_part, .. } = &self.bricks[brick];
+        self.art.of_part[part].shape.vertices.iter().map(|p| object_from_ldraw(&frame_from_part.apply(p)))
+    }
+
+    /// The box around all bricks.
+    pub fn bounds(&self) -> Aabb {
+        let mut bounds = Aabb::empty();
+        (0..self.bricks()).for_each(|brick| self.vertices(brick).for_each(|p| bounds.add(&p)));
+        bounds
+    }
+
+    /// The bare geometry of some bricks.
+    pub fn mesh(&self, bricks: Range<usize>) -> TriangleMesh {
+        let (mut vertices, mut triangles) = (vec![], vec![]);
+        for brick in bricks {
+            let base = vertices.len() as u32;
+            vertices.extend(self.vertices(brick));
+            let shape = &self.art.of_part[&self.bricks[brick].part].shape;
+            triangles.extend(shape.triangles.iter().map(|t| t.map(|v| base + v)));
         }
+        TriangleMesh::new(vertices, triangles)
     }
 
-    /// The surface of the first `bricks` bricks.
-    pub fn mesh_of(&self, bricks: usize) -> TriangleMesh {
-        let [vertices, triangles, _] = self.end(bricks);
-        TriangleMesh {
-            vertices: self.mesh.vertices[..vertices].to_vec(),
-            triangles: self.mesh.triangles[..triangles].to_vec(),
-            vertex_colors: None,
-            triangle_colors: self.mesh.triangle_colors.as_ref().map(|c| c[..triangles].to_vec()),
-            triangle_parts: self.mesh.triangle_parts.as_ref().map(|p| p[..triangles].to_vec()),
+    /// The surface of some bricks.
+    pub fn surface(&self, bricks: Range<usize>) -> Surface {
+        let mut mesh = self.mesh(bricks.clone());
+        let (mut colors, mut parts) = (vec![], vec![]);
+        let (mut normals, mut opacity, mut edges) = (vec![], vec![], vec![]);
+        let mut first = 0;
+        for (index, brick) in bricks.enumerate() {
+            let Placed { part, color, frame_from_part, inverted } = &self.bricks[brick];
+            let SmoothShape { shape, normals: of_part } = &self.art.of_part[part];
+            let triangles = first..first + shape.triangles.len();
+            first = triangles.end;
+            let flip = inverted ^ frame_from_part.is_mirrored();
+            if flip {
+                mesh.triangles[triangles].iter_mut().for_each(|t| t.swap(1, 2));
+            }
+            // Normals turn with the inverse transposed; the change of axes is a half turn.
+            let turn = frame_from_part.linear.try_inverse().map_or_else(Matrix3::identity, |m| m.transpose());
+            let turned = |n: &Vector3<f32>| {
+                let n = turn * n.cast::<f64>();
+                Vector3::new(n.x, -n.y, -n.z).try_normalize(0.0).unwrap_or_else(Vector3::y).cast()
+            };
+            normals.extend(of_part.iter().map(|[a, b, c]| {
+                let [a, b, c] = [turned(a), turned(b), turned(c)];
+                if flip { [a, c, b] } else { [a, b, c] }
+            }));
+            let own = self.model.colors().look(*color);
+            let mut known: Vec<(ColorCode, Color)> = vec![];
+            for &code in &shape.colors {
+                let at = known.iter().position(|(other, _)| *other == code).unwrap_or_else(|| {
+                    known.push((code, surface_color(self.model, code, &own)));
+                    known.len() - 1
+                });
+                let look = &known[at].1;
+                colors.push(look.rgb);
+                opacity.push(if look.alpha == 255 { 255 } else { look.alpha.clamp(90, 200) });
+            }
+            parts.resize(first, index as u32);
+            let placed = |p: &Point3<f64>| object_from_ldraw(&frame_from_part.apply(p));
+            edges.extend(
+                shape.edges.iter().map(|edge| SharpEdge { ends: edge.ends.map(|p| placed(&p)), part: index as u32 }),
+            );
         }
+        (mesh.triangle_colors, mesh.triangle_parts) = (Some(colors), Some(parts));
+        Surface { mesh, normals, opacity, edges }
     }
 
-    /// The surface of bricks `from..to` alone.
-    pub fn mesh_between(&self, from: usize, to: usize) -> TriangleMesh {
-        let ([v0, t0, _], [v1, t1, _]) = (self.end(from), self.end(to));
-        TriangleMesh {
-            vertices: self.mesh.vertices[v0..v1].to_vec(),
-            triangles: self.mesh.triangles[t0..t1].iter().map(|t| t.map(|v| v - v0 as u32)).collect(),
-            vertex_colors: None,
-            triangle_colors: None,
-            triangle_parts: self.mesh.triangle_parts.as_ref().map(|p| p[t0..t1].to_vec()),
-        }
+    /// How a brick looks.
+    pub fn look(&self, brick: usize, fade: f32, highlighted: bool) -> Look {
+        Look { line: line_rgb(self.model.colors().look(self.bricks[brick].color).rgb), fade, highlighted }
     }
-
-    /// How the first `bricks` bricks look: those before `new` faded by `fade`, the others highlighted.
-    pub fn looks(&self, bricks: usize, new: usize, fade: f32, highlight: bool) -> Vec<Look> {
-        let look = |index: usize| Look {
-            line: self.lines[index],
-            fade: if index < new { fade } else { 0.0 },
-            highlighted: highlight && index >= new,
-        };
-        (0..bricks).map(look).collect()
-    }
-
-    /// Vertices of brick `index`.
-    pub fn vertices(&self, index: usize) -> &[Point3<f64>] {
-        &self.mesh.vertices[self.end(index)[0]..self.end(index + 1)[0]]
-    }
-
-    /// The box around the first `bricks` bricks.
-    pub fn bounds(&self, bricks: usize) -> Aabb {
-        Aabb::of(&self.mesh.vertices[..self.end(bricks)[0]])
-    }
-
-    fn end(&self, bricks: usize) -> [usize; 3] {
-        if bricks == 0 { [0; 3] } else { self.ends[bricks - 1] }
-    }
-}
-
-fn oriented_normals(flip: bool, [a, b, c]: [Vector3<f32>; 3]) -> [Vector3<f32>; 3] {
-    if flip { [a, c, b] } else { [a, b, c] }
 }
 
 /// What a face with `code` looks like on a brick of colour `own`.
-fn surface(model: &Model, code: ColorCode, own: &Color) -> Color {
+fn surface_color(model: &Model, code: ColorCode, own: &Color) -> Color {
     match code {
         ColorCode::INHERIT => own.clone(),
         ColorCode::EDGE => Color { rgb: own.edge_rgb, alpha: 255, ..own.clone() },

@@ -372,7 +372,7 @@ impl Layout<'_> {
 
         let shots = &self.sheets.steps[section];
         if step > 0
-            && let Some(turn) = shots[step - 1].look.turn_to(&shots[step].look)
+            && let Some(turn) = shots[step - 1].sight.look.turn_to(&shots[step].sight.look)
         {
             self.view_changes += 1;
             let [x, y] = arrangement.number;

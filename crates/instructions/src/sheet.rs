@@ -3,11 +3,13 @@
 use std::collections::BTreeMap;
 
 use mb_bricks::Model;
+use mb_geometry::ImageSize;
 use mb_job::{Progress, Result, Steps};
+use mb_render::View;
 
 use crate::geometry::{Assembly, PartArt};
 use crate::plan::{PieceKind, Plan, Section};
-use crate::views::{Frame, Look, choose, frames};
+use crate::views::{Frame, Look, Shown, Sight, choose};
 
 /// Paper millimetres for a metre of the model, at most: four fifths of the real size.
 const LARGEST_SCALE: f64 = 800.0;
@@ -23,7 +25,7 @@ pub(crate) const EDGE_MM: f64 = 1.2;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Shot {
     /// From where.
-    pub look: Look,
+    pub sight: Sight,
     /// What is in it.
     pub frame: Frame,
     /// Paper millimetres for a metre.
@@ -33,7 +35,20 @@ pub(crate) struct Shot {
 impl Shot {
     /// Width and height on paper, millimetres.
     pub fn size_mm(&self) -> [f64; 2] {
-        self.frame.size_m.map(|v| v * self.scale + 2.0 * EDGE_MM)
+        self.frame.size_m().map(|v| v * self.scale + 2.0 * EDGE_MM)
+    }
+
+    /// The first pixel, counted from the section's middle, and width and height in pixels.
+    pub fn pixels(&self, px_per_mm: f64) -> ([i64; 2], ImageSize) {
+        let first = self.frame.low.map(|v| ((v * self.scale - EDGE_MM) * px_per_mm).floor() as i64);
+        let [w, h] = self.size_mm().map(|v| (v * px_per_mm).round().clamp(1.0, 8000.0) as usize);
+        (first, ImageSize::new(w, h))
+    }
+
+    /// The view of these pixels.
+    pub fn view(&self, px_per_mm: f64) -> View<Shown> {
+        let (first, size) = self.pixels(px_per_mm);
+        self.sight.view(first, size, 1.0 / (self.scale * px_per_mm))
     }
 }
 
@@ -53,7 +68,7 @@ impl Sheets {
             let assembly = Assembly::of_section(model, art, section);
             let shots = section_shots(section, &assembly);
             if let Some(last) = shots.last() {
-                pieces.insert(PieceKind::Submodel(index), piece_shot(last.look, last.frame));
+                pieces.insert(PieceKind::Submodel(index), piece_shot(last.sight, last.frame));
             }
             steps.push(shots);
             counter.step()?;
@@ -63,37 +78,39 @@ impl Sheets {
                 && !pieces.contains_key(&kind)
             {
                 let assembly = Assembly::of_part(model, art, part, color);
-                let look = Look::usual();
-                pieces.insert(kind, piece_shot(look, frames(&assembly, &look)[1]));
+                let sight = Sight::new(Look::usual(), &assembly.bounds());
+                pieces.insert(kind, piece_shot(sight, sight.frames(&assembly)[1]));
             }
         }
         Ok(Self { steps, pieces })
     }
 }
 
-fn piece_shot(look: Look, frame: Frame) -> Shot {
-    let scale = (0..2).map(|i| LARGEST_PIECE_MM[i] / frame.size_m[i].max(1e-9)).fold(PIECE_SCALE, f64::min);
-    Shot { look, frame, scale }
+fn piece_shot(sight: Sight, frame: Frame) -> Shot {
+    let size = frame.size_m();
+    let scale = (0..2).map(|i| LARGEST_PIECE_MM[i] / size[i].max(1e-9)).fold(PIECE_SCALE, f64::min);
+    Shot { sight, frame, scale }
 }
 
 /// The pictures of a section's steps, all at one scale.
 fn section_shots(section: &Section, assembly: &Assembly) -> Vec<Shot> {
-    let looks = choose(section, assembly);
-    let mut known: Vec<(Look, Vec<Frame>)> = vec![];
+    let bounds = assembly.bounds();
+    let mut known: Vec<(Sight, Vec<Frame>)> = vec![];
     let mut bricks = 0;
     let mut shots: Vec<Shot> = vec![];
-    for (step, look) in section.steps.iter().zip(looks) {
+    for (step, look) in section.steps.iter().zip(choose(section, assembly)) {
         bricks += step.bricks().count();
-        let at = known.iter().position(|(other, _)| *other == look).unwrap_or_else(|| {
-            known.push((look, frames(assembly, &look)));
+        let at = known.iter().position(|(other, _)| other.look == look).unwrap_or_else(|| {
+            let sight = Sight::new(look, &bounds);
+            known.push((sight, sight.frames(assembly)));
             known.len() - 1
         });
-        shots.push(Shot { look, frame: known[at].1[bricks], scale: LARGEST_SCALE });
+        let (sight, frames) = &known[at];
+        shots.push(Shot { sight: *sight, frame: frames[bricks], scale: LARGEST_SCALE });
     }
     let fits = |shot: &Shot| {
-        (0..2)
-            .map(|i| (LARGEST_STEP_MM[i] - 2.0 * EDGE_MM) / shot.frame.size_m[i].max(1e-9))
-            .fold(f64::INFINITY, f64::min)
+        let size = shot.frame.size_m();
+        (0..2).map(|i| (LARGEST_STEP_MM[i] - 2.0 * EDGE_MM) / size[i].max(1e-9)).fold(f64::INFINITY, f64::min)
     };
     let scale = shots.iter().map(fits).fold(LARGEST_SCALE, f64::min);
     shots.iter_mut().for_each(|shot| shot.scale = scale);

@@ -1,9 +1,10 @@
 //! From where the model is seen, step after step: always the same way, unless what is new would be hidden.
 
 use mb_bricks::StepView;
-use mb_geometry::ImageSize;
+use mb_geometry::{Aabb, ImageSize};
 use mb_render::{NO_TRIANGLE, Scene, View};
-use nalgebra::{Matrix3, Rotation3, Vector3};
+use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
+use rayon::prelude::*;
 
 use crate::geometry::Assembly;
 use crate::plan::Section;
@@ -12,7 +13,7 @@ use crate::plan::Section;
 const AZIMUTH_DEG: f64 = -38.0;
 const ELEVATION_DEG: f64 = 30.0;
 /// Long side of the pictures in which visible pixels are counted.
-const TRIAL_PX: f64 = 320.0;
+const TRIAL_PX: f64 = 400.0;
 /// A piece is seen well enough when this share of it is visible.
 const WELL_SEEN: f64 = 0.22;
 /// A piece that is seen less than this (as a share of [`WELL_SEEN`]) asks for another view.
@@ -82,12 +83,6 @@ impl Look {
         Self { forward: model_from_turned * base.forward, up: model_from_turned * base.up }
     }
 
-    /// The picture's right and down.
-    fn axes(&self) -> (Vector3<f64>, Vector3<f64>) {
-        let right = self.forward.cross(&self.up).normalize();
-        (right, self.forward.cross(&right))
-    }
-
     /// What turns the model from `self` to `other`; `None` where they are the same.
     pub fn turn_to(&self, other: &Self) -> Option<Turn> {
         if (self.forward - other.forward).norm() < 1e-6 && (self.up - other.up).norm() < 1e-6 {
@@ -98,53 +93,80 @@ impl Look {
             Some(Turn::Round)
         }
     }
-
-    /// The picture of bricks from this view at a scale, and its size.
-    pub fn view(&self, frame: &Frame, size: ImageSize, metres_per_px: f64) -> View<Shown> {
-        View::from_afar(&frame.middle, &self.forward, &self.up, size, metres_per_px, frame.reach)
-    }
 }
 
-/// The rectangle that bricks fill in a view.
+/// A look at a section from a place that all its pictures share.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Frame {
-    /// Width and height, metres.
-    pub size_m: [f64; 2],
-    /// Middle of the picture, in the section's frame.
-    pub middle: nalgebra::Point3<f64>,
+pub(crate) struct Sight {
+    pub look: Look,
+    /// Middle of the finished section, in its frame.
+    middle: Point3<f64>,
     /// Radius about the middle that holds everything.
-    pub reach: f64,
+    reach: f64,
 }
 
-/// The frames of the first bricks of an assembly, for one view: entry `n` is that of the first `n`.
-pub(crate) fn frames(assembly: &Assembly, look: &Look) -> Vec<Frame> {
-    let (right, down) = look.axes();
-    let axes = [right, down, look.forward];
-    let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
-    let mut frames = vec![];
-    for brick in 0..=assembly.bricks() {
-        let empty = low[0] > high[0];
-        let middle = if empty { [0.0; 3] } else { std::array::from_fn(|i| 0.5 * (low[i] + high[i])) };
-        let size: [f64; 3] = if empty { [0.0; 3] } else { std::array::from_fn(|i| high[i] - low[i]) };
-        let middle = right * middle[0] + down * middle[1] + look.forward * middle[2];
-        let reach = 0.5 * (size[0].powi(2) + size[1].powi(2) + size[2].powi(2)).sqrt();
-        frames.push(Frame { size_m: [size[0], size[1]], middle: middle.into(), reach });
-        if brick < assembly.bricks() {
+impl Sight {
+    /// `bounds` is the box around the finished section.
+    pub fn new(look: Look, bounds: &Aabb) -> Self {
+        let (middle, reach) =
+            if bounds.is_empty() { (Point3::origin(), 0.0) } else { (bounds.center(), 0.5 * bounds.extent().norm()) };
+        Self { look, middle, reach }
+    }
+
+    /// The picture of `size` pixels whose first one is the pixel `first`, counted from the section's middle.
+    pub fn view(&self, first: [i64; 2], size: ImageSize, metres_per_px: f64) -> View<Shown> {
+        let Look { forward, up } = &self.look;
+        let mut view = View::from_afar(&self.middle, forward, up, size, metres_per_px, self.reach);
+        (view.intrinsics.cx, view.intrinsics.cy) = (-first[0] as f64, -first[1] as f64);
+        view
+    }
+
+    /// The frames of the first bricks of an assembly: entry `n` is that of the first `n`.
+    pub fn frames(&self, assembly: &Assembly) -> Vec<Frame> {
+        let in_metres = self.view([0; 2], ImageSize::new(1, 1), 1.0);
+        let mut frame = Frame { low: [f64::INFINITY; 2], high: [f64::NEG_INFINITY; 2] };
+        let mut frames = vec![Frame { low: [0.0; 2], high: [0.0; 2] }];
+        for brick in 0..assembly.bricks() {
             for p in assembly.vertices(brick) {
-                for (i, axis) in axes.iter().enumerate() {
-                    let v = p.coords.dot(axis);
-                    low[i] = low[i].min(v);
-                    high[i] = high[i].max(v);
+                let Some(p) = in_metres.intrinsics.img_from_cam(&(in_metres.cam_from_frame * p)) else { continue };
+                for axis in 0..2 {
+                    frame.low[axis] = frame.low[axis].min(p[axis]);
+                    frame.high[axis] = frame.high[axis].max(p[axis]);
                 }
             }
+            frames.push(if frame.low[0] <= frame.high[0] { frame } else { frames[0] });
+        }
+        frames
+    }
+}
+
+/// The rectangle that bricks fill in a picture: metres from the section's middle, rightwards and downwards.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Frame {
+    pub low: [f64; 2],
+    pub high: [f64; 2],
+}
+
+impl Frame {
+    /// Width and height.
+    pub fn size_m(&self) -> [f64; 2] {
+        [self.high[0] - self.low[0], self.high[1] - self.low[1]]
+    }
+
+    /// The frame with more around it: shares of its width and height.
+    pub fn grown(&self, shares: [f64; 2]) -> Self {
+        let size = self.size_m();
+        let margin: [f64; 2] = std::array::from_fn(|i| 0.5 * shares[i] * size[i]);
+        Self {
+            low: std::array::from_fn(|i| self.low[i] - margin[i]),
+            high: std::array::from_fn(|i| self.high[i] + margin[i]),
         }
     }
-    frames
 }
 
 /// The view of each step.
 pub(crate) fn choose(section: &Section, assembly: &Assembly) -> Vec<Look> {
-    let candidates = [
+    let looks = [
         Look::usual(),
         Look::around(90.0),
         Look::around(-90.0),
@@ -152,112 +174,128 @@ pub(crate) fn choose(section: &Section, assembly: &Assembly) -> Vec<Look> {
         Look::from_below(0.0),
         Look::from_below(180.0),
     ];
-    let mut trial = Trial { section, assembly, candidates, known: std::collections::HashMap::new(), ends: vec![0] };
-    for step in &section.steps {
-        let last = *trial.ends.last().unwrap_or(&0);
-        trial.ends.push(last + step.bricks().count());
-    }
+    let bounds = assembly.bounds();
+    let mut trials: Vec<Trial> = looks.iter().map(|look| Trial::new(assembly, Sight::new(*look, &bounds))).collect();
     let mut current = 0;
-    let mut looks = vec![];
+    let mut chosen = vec![];
     for (index, step) in section.steps.iter().enumerate() {
         if let Some(view) = step.view {
-            looks.push(Look::of_author(view));
+            chosen.push(Look::of_author(view));
             continue;
         }
         let soon = index..(index + AHEAD).min(section.steps.len());
-        if current != 0 && !soon.clone().any(|step| trial.hides(step, 0)) {
-            current = 0;
+        if current != 0 {
+            trials[0].build(section, assembly, soon.end);
+            if !soon.clone().any(|step| trials[0].hides(step)) {
+                current = 0;
+            }
         }
-        if trial.hides(index, current) {
-            let cost = |trial: &mut Trial, view: usize| {
+        trials[current].build(section, assembly, index + 1);
+        if trials[current].hides(index) {
+            trials.par_iter_mut().for_each(|trial| trial.build(section, assembly, soon.end));
+            let cost = |view: usize| {
                 // Upside down is the last resort.
                 let change = if view == current { 0.0 } else { CHANGE };
-                let later: f64 = (index + 1..soon.end).map(|step| trial.cost(step, view)).sum();
-                trial.cost(index, view) + LATER * later + change + if view >= 4 { OVER } else { 0.0 }
+                let later: f64 = (index + 1..soon.end).map(|step| trials[view].cost(section, step)).sum();
+                trials[view].cost(section, index) + LATER * later + change + if view >= 4 { OVER } else { 0.0 }
             };
-            let costs: Vec<f64> = (0..trial.candidates.len()).map(|view| cost(&mut trial, view)).collect();
+            let costs: Vec<f64> = (0..trials.len()).map(cost).collect();
             current = (0..costs.len()).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(current);
         }
-        looks.push(trial.candidates[current]);
+        chosen.push(looks[current]);
     }
-    looks
+    chosen
 }
 
-/// Small pictures in which visible pixels are counted.
-struct Trial<'a> {
-    section: &'a Section,
-    assembly: &'a Assembly,
-    candidates: [Look; 6],
-    /// How well each piece of a step is seen in a view, 0 to 1.
-    known: std::collections::HashMap<(usize, usize), Vec<f64>>,
-    /// Bricks at the beginning of each step, and at the end.
-    ends: Vec<usize>,
+/// A small picture of one view in which a section is built and visible pixels are counted.
+struct Trial {
+    view: View<Shown>,
+    /// Depth of what is nearest, 0 where there is nothing.
+    depth: Vec<f32>,
+    /// Number of the piece that is nearest, counted through all steps.
+    piece: Vec<u32>,
+    /// Bricks and pieces that are built.
+    bricks: usize,
+    pieces: u32,
+    /// Of each step that is built, how well each piece is seen, 0 to 1.
+    seen: Vec<Vec<f64>>,
 }
 
-impl Trial<'_> {
-    fn hides(&mut self, step: usize, view: usize) -> bool {
-        self.seen(step, view).iter().any(|&seen| seen < HIDDEN)
+impl Trial {
+    fn new(assembly: &Assembly, sight: Sight) -> Self {
+        let frame = sight.frames(assembly)[assembly.bricks()];
+        let [w, h] = frame.size_m();
+        let metres_per_px = w.max(h).max(1e-6) / TRIAL_PX;
+        let px = |m: f64| (m / metres_per_px).ceil() as usize + 2;
+        let first = frame.low.map(|m| (m / metres_per_px).floor() as i64);
+        let size = ImageSize::new(px(w), px(h));
+        Self {
+            view: sight.view(first, size, metres_per_px),
+            depth: vec![0.0; size.pixels()],
+            piece: vec![u32::MAX; size.pixels()],
+            bricks: 0,
+            pieces: 0,
+            seen: vec![],
+        }
+    }
+
+    fn hides(&self, step: usize) -> bool {
+        self.seen[step].iter().any(|&seen| seen < HIDDEN)
     }
 
     /// Hidden pieces; half as bad where an equal one is well seen, as with the wheels on the far side of a car.
-    fn cost(&mut self, step: usize, view: usize) -> f64 {
-        let pieces = &self.section.steps[step].pieces;
-        let seen = self.seen(step, view);
+    fn cost(&self, section: &Section, step: usize) -> f64 {
+        let (pieces, seen) = (&section.steps[step].pieces, &self.seen[step]);
         let shown = |kind| pieces.iter().zip(seen).any(|(other, &seen)| other.kind == kind && seen >= 1.0);
         pieces.iter().zip(seen).map(|(piece, seen)| (1.0 - seen) * if shown(piece.kind) { 0.5 } else { 1.0 }).sum()
     }
 
-    fn seen(&mut self, step: usize, view: usize) -> &[f64] {
-        if !self.known.contains_key(&(step, view)) {
-            let seen = self.measure(step, &self.candidates[view]);
-            self.known.insert((step, view), seen);
+    /// Builds on until `steps` steps are there.
+    fn build(&mut self, section: &Section, assembly: &Assembly, steps: usize) {
+        for step in self.seen.len()..steps {
+            let first = self.pieces;
+            // Of each piece, what could be seen if it stood alone.
+            let mut alone = vec![];
+            for piece in &section.steps[step].pieces {
+                alone.push(self.add(&assembly.mesh(self.bricks..self.bricks + piece.bricks.len())));
+                self.bricks += piece.bricks.len();
+            }
+            let mut visible = vec![0_usize; alone.len()];
+            for &piece in self.piece.iter().filter(|&&piece| piece >= first && piece < self.pieces) {
+                visible[(piece - first) as usize] += 1;
+            }
+            let share = |(&visible, &alone): (&usize, &usize)| match alone {
+                0 => 1.0,
+                alone => (visible as f64 / alone as f64 / WELL_SEEN).min(1.0),
+            };
+            self.seen.push(visible.iter().zip(&alone).map(share).collect());
         }
-        &self.known[&(step, view)]
     }
 
-    fn measure(&self, step: usize, look: &Look) -> Vec<f64> {
-        let (before, after) = (self.ends[step], self.ends[step + 1]);
-        let bounds = self.assembly.bounds(after);
-        let extent = bounds.extent().norm().max(1e-6);
-        let size = ImageSize::new(TRIAL_PX as usize, TRIAL_PX as usize);
-        let frame = Frame { size_m: [extent; 2], middle: bounds.center(), reach: 0.5 * extent };
-        let view = look.view(&frame, size, extent / TRIAL_PX);
-        let count = |mesh: &mb_mesh::TriangleMesh| {
-            let raster = Scene::new(mesh).render(&view);
-            let mut pixels = vec![0usize; after - before];
-            let parts = mesh.triangle_parts.as_deref().unwrap_or_default();
-            for &t in raster.triangle.data().iter().filter(|&&t| t != NO_TRIANGLE) {
-                let part = parts[t as usize] as usize;
-                if part >= before {
-                    pixels[part - before] += 1;
+    /// Adds a piece; returns how many pixels it has by itself.
+    fn add(&mut self, mesh: &mb_mesh::TriangleMesh) -> usize {
+        let number = self.pieces;
+        self.pieces += 1;
+        let Some((window, raster)) = Scene::new(mesh).render_where_seen(&self.view) else { return 0 };
+        let mut alone = 0;
+        for (row, pixels) in raster.triangle.data().chunks(window.size.width).enumerate() {
+            let start = (window.y + row) * self.view.size.width + window.x;
+            for (x, _) in pixels.iter().enumerate().filter(|&(_, &t)| t != NO_TRIANGLE) {
+                alone += 1;
+                let z = raster.depth[(x, row)];
+                if self.depth[start + x] == 0.0 || z <= self.depth[start + x] {
+                    (self.depth[start + x], self.piece[start + x]) = (z, number);
                 }
             }
-            pixels
-        };
-        let visible = count(&self.assembly.mesh_of(after));
-        let mut at = 0;
-        self.section.steps[step]
-            .pieces
-            .iter()
-            .map(|piece| {
-                let range = at..at + piece.bricks.len();
-                at = range.end;
-                // What of the piece could be seen if it stood alone.
-                let alone: usize = count(&self.assembly.mesh_between(before + range.start, before + range.end))
-                    [range.clone()]
-                .iter()
-                .sum();
-                let seen: usize = visible[range].iter().sum();
-                if alone == 0 { 1.0 } else { (seen as f64 / alone as f64 / WELL_SEEN).min(1.0) }
-            })
-            .collect()
+        }
+        alone
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::{Point2, Point3};
+    use nalgebra::Point2;
 
     fn pixel(view: &View<Shown>, p: &Point3<f64>) -> Point2<f64> {
         view.intrinsics.img_from_cam(&(view.cam_from_frame * *p)).expect("in front")
@@ -265,10 +303,10 @@ mod tests {
 
     #[test]
     fn the_usual_view_shows_top_and_front_and_keeps_scale() {
-        let frame = Frame { size_m: [0.1, 0.1], middle: Point3::origin(), reach: 0.1 };
-        let view = Look::usual().view(&frame, ImageSize::new(200, 200), 0.001);
+        let bounds = Aabb { min: Point3::new(-0.1, -0.1, -0.1), max: Point3::new(0.1, 0.1, 0.1) };
+        let view = Sight::new(Look::usual(), &bounds).view([-100, -80], ImageSize::new(200, 200), 0.001);
         let middle = pixel(&view, &Point3::origin());
-        assert!((middle - Point2::new(99.5, 99.5)).norm() < 1e-9);
+        assert!((middle - Point2::new(100.0, 80.0)).norm() < 1e-9);
         assert!(pixel(&view, &Point3::new(0.0, 0.05, 0.0)).y < middle.y, "up is up");
         assert!(Look::usual().forward.y < 0.0 && Look::usual().forward.z < 0.0, "from above and from the front");
         let near = pixel(&view, &Point3::new(0.01, 0.0, 0.0)) - pixel(&view, &Point3::origin());

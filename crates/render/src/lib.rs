@@ -20,7 +20,8 @@
 //! ```
 
 mod cluster;
-mod line_art;
+mod compose;
+mod drawing;
 mod outside;
 mod overlay;
 mod raster;
@@ -31,11 +32,11 @@ mod shade;
 mod strip;
 mod view;
 
-pub use line_art::{LineArt, LineArtOptions, Look, SharpEdge, line_art};
+pub use drawing::{Drawing, DrawingOptions, LineArt, Look, SharpEdge};
 pub use outside::{OutsideSummary, outside_only};
 pub use overlay::overlay_edges;
 pub use raster::{NO_TRIANGLE, Raster};
 pub use ray_cast::ray_cast;
 pub use scene::Scene;
 pub use shade::{RgbaImage, ShadeOptions, heat_colors, over, shade, three_quarter_view};
-pub use view::View;
+pub use view::{View, Window};

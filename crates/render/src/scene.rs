@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use crate::cluster::{self, CLUSTER, Placed};
 use crate::setup::{Corner, Setup};
 use crate::strip::{Piece, STRIP, Strip};
-use crate::{Raster, View};
+use crate::{Raster, View, Window};
 
 /// A mesh, ready to be rendered from many views.
 pub struct Scene {
@@ -47,6 +47,17 @@ impl Scene {
             strip.write_triangles(triangle);
         });
         Raster { depth, triangle }
+    }
+
+    /// Like [`render`](Self::render), of the part of the image that the mesh may fill; `None` where it is not in the
+    /// image. For meshes in front of the camera.
+    ///
+    /// # Panics
+    /// As for [`render`](Self::render).
+    pub fn render_where_seen<F>(&self, view: &View<F>) -> Option<(Window, Raster)> {
+        let seen = |p: &Point3<f64>| view.intrinsics.img_from_cam(&(view.cam_from_frame * *p)).map(|p| [p.x, p.y]);
+        let window = Window::around(self.clusters.iter().flat_map(Aabb::corners).filter_map(|p| seen(&p)), view.size)?;
+        Some((window, self.render(&view.within(&window))))
     }
 
     /// Depth alone, metres; 0 where nothing is seen.

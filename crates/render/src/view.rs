@@ -44,4 +44,41 @@ impl<F> View<F> {
     pub fn ray(&self, x: usize, y: usize) -> Ray {
         self.intrinsics.ray(&Point2::new(x as f64, y as f64), &self.cam_from_frame.inverse())
     }
+
+    /// The part of the view inside a window, as a view of its own.
+    pub fn within(&self, window: &Window) -> Self {
+        let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
+        let (cx, cy) = (cx - window.x as f64, cy - window.y as f64);
+        Self { intrinsics: Intrinsics { fx, fy, cx, cy }, size: window.size, cam_from_frame: self.cam_from_frame }
+    }
+}
+
+/// A rectangle of an image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Window {
+    /// First column.
+    pub x: usize,
+    /// First row.
+    pub y: usize,
+    /// Width and height, at least 1.
+    pub size: ImageSize,
+}
+
+impl Window {
+    /// The pixels of an image of `size` around some places in it; `None` where there are none.
+    pub fn around(places: impl IntoIterator<Item = [f64; 2]>, size: ImageSize) -> Option<Self> {
+        let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+        for place in places {
+            for axis in 0..2 {
+                low[axis] = low[axis].min(place[axis]);
+                high[axis] = high[axis].max(place[axis]);
+            }
+        }
+        let range = |axis: usize, count: usize| {
+            let (first, last) = (low[axis].floor().max(0.0), high[axis].ceil().min(count as f64 - 1.0));
+            (first <= last).then(|| (first as usize, last as usize + 1 - first as usize))
+        };
+        let ((x, width), (y, height)) = (range(0, size.width)?, range(1, size.height)?);
+        Some(Self { x, y, size: ImageSize::new(width, height) })
+    }
 }
