@@ -8,6 +8,7 @@ use mb_render::View;
 use nalgebra::{Matrix3, Point2, Point3, Vector3};
 use rand::RngExt;
 
+use crate::lens::Distortion;
 use crate::random::normal;
 use crate::stage::Stage;
 use crate::streams;
@@ -62,6 +63,7 @@ pub(crate) struct ClickView {
     pub frame: FrameId,
     pub intrinsics: Intrinsics,
     pub size: ImageSize,
+    pub distortion: Distortion,
     pub object_from_cam: Rigid3<Object, mb_geometry::Camera>,
 }
 
@@ -104,7 +106,7 @@ pub(crate) fn click(
             let error = nalgebra::Vector2::new(normal(&mut rng), normal(&mut rng)) * noise_px;
             keypoints.push(Keypoint {
                 frame: view.frame,
-                pixel: pixel + error,
+                pixel: view.distortion.distorted(&view.intrinsics, &pixel) + error,
                 point_in_object_m: corner.point,
                 name: format!("corner of part {}", corner.part),
             });

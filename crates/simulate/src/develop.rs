@@ -1,4 +1,7 @@
-//! From radiance to the photograph that the phone stores: lens, sensor, and the phone's own processing.
+//! From radiance to the photograph that the phone stores: lens, sensor, and the phone's own processing, which smooths noise,
+//! bends tones and sharpens what is bright or dark, in this order.
+
+use std::ops::{Add, Mul};
 
 use glam::Vec3;
 use mb_image::{Image, RgbImage};
@@ -18,14 +21,15 @@ pub(crate) struct Development {
     pub white_balance: Vec3,
 }
 
-/// Standard deviation of the lens blur with the phone's own smoothing, pixels of a 1920-pixel-wide photograph.
-const BLUR_PX: f32 = 0.5;
-/// Strength of the phone's sharpening: it adds this share of what a blur of [`SHARPEN_PX`] removes.
-const SHARPEN: f32 = 1.0;
-const SHARPEN_PX: f32 = 1.1;
-/// Noise after the phone's denoising: variance is `READ^2 + SHOT * signal`, signal 1 is white.
-const READ: f32 = 0.0028;
-const SHOT: f32 = 0.000_07;
+/// Standard deviation of the lens's blur and of the phone's smoothing of noise together, pixels of a 1920-pixel-wide
+/// photograph.
+const BLUR_PX: f32 = 0.70;
+/// The phone's sharpening: it adds this share of what a blur of [`SHARPEN_PX`] removes from the brightness.
+const SHARPEN: f32 = 1.2;
+const SHARPEN_PX: f32 = 1.2;
+/// Noise of the sensor: variance is `READ^2 + SHOT * signal`, signal 1 is white.
+const READ: f32 = 0.0052;
+const SHOT: f32 = 0.000_30;
 /// Light that the corners of the frame lose.
 const VIGNETTE: f32 = 0.10;
 
@@ -54,65 +58,95 @@ fn luminance(p: Vec3) -> f32 {
 }
 
 /// Separable Gaussian blur.
-fn blurred(image: &Image<Vec3>, sigma_px: f32) -> Image<Vec3> {
-    let radius = (2.5 * sigma_px).ceil() as isize;
-    let kernel: Vec<f32> = (-radius..=radius).map(|d| (-0.5 * (d as f32 / sigma_px).powi(2)).exp()).collect();
-    let total: f32 = kernel.iter().sum();
+pub(crate) fn blurred<T>(image: &Image<T>, sigma_px: f32) -> Image<T>
+where
+    T: Copy + Send + Sync + Add<Output = T> + Mul<f32, Output = T>,
+{
+    let radius = (2.5 * sigma_px).ceil() as usize;
+    let kernel: Vec<f32> = (0..=radius).map(|d| (-0.5 * (d as f32 / sigma_px).powi(2)).exp()).collect();
+    let total = kernel[0] + 2.0 * kernel[1..].iter().sum::<f32>();
+    let kernel: Vec<f32> = kernel.iter().map(|w| w / total).collect();
     let (width, height) = (image.width(), image.height());
-    let convolve = |count: usize, at: usize, sample: &dyn Fn(usize) -> Vec3| -> Vec3 {
-        kernel
-            .iter()
-            .zip(-radius..)
-            .map(|(w, d)| sample((at as isize + d).clamp(0, count as isize - 1) as usize) * *w)
-            .sum::<Vec3>()
-            / total
-    };
-    let mut across = vec![Vec3::ZERO; width * height];
-    across.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
+    // Each output pixel is a weighted sum of pairs at the same distance before and after it.
+    let mut across = image.clone();
+    across.data_mut().par_chunks_mut(width).enumerate().for_each(|(y, row)| {
         let source = image.row(y);
         for (x, out) in row.iter_mut().enumerate() {
-            *out = convolve(width, x, &|i| source[i]);
+            *out = source[x] * kernel[0];
+            for (d, w) in kernel.iter().enumerate().skip(1) {
+                *out = *out + (source[x.saturating_sub(d)] + source[(x + d).min(width - 1)]) * *w;
+            }
         }
     });
-    let mut out = Image::filled(image.size(), Vec3::ZERO);
+    let mut out = across.clone();
     out.data_mut().par_chunks_mut(width).enumerate().for_each(|(y, row)| {
-        for (x, out) in row.iter_mut().enumerate() {
-            *out = convolve(height, y, &|j| across[j * width + x]);
+        row.iter_mut().for_each(|v| *v = *v * kernel[0]);
+        for (d, w) in kernel.iter().enumerate().skip(1) {
+            let (above, below) = (across.row(y.saturating_sub(d)), across.row((y + d).min(height - 1)));
+            for ((v, a), b) in row.iter_mut().zip(above).zip(below) {
+                *v = *v + (*a + *b) * *w;
+            }
         }
     });
     out
 }
 
-/// The tone curve of a phone: sRGB with a lifted contrast and a soft shoulder, from linear signal (1 = white).
+/// The tone curve of a phone, from linear signal (1 = white) to display, 0 to 1: shadows are lifted off black, the
+/// middle has contrast, and highlights bend over a soft shoulder.
 fn tone(v: f32) -> f32 {
-    // The shoulder bends off what lies above 0.6 towards 1.
-    let v = if v > 0.6 { 0.6 + 0.4 * (1.0 - (-(v - 0.6) / 0.4).exp()) } else { v.max(0.0) };
+    const SHOULDER: f32 = 0.5;
+    let v = v.max(0.0);
+    let v = if v > SHOULDER { SHOULDER + (1.0 - SHOULDER) * (1.0 - (-(v - SHOULDER) / 0.62).exp()) } else { v };
     let encoded = if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 };
     // A gentle S round the middle.
     encoded + 0.10 * (encoded - 0.5) * 4.0 * encoded * (1.0 - encoded)
 }
 
+/// [`tone`] by interpolation in a table: a power for each channel of each pixel would be the longest step of all.
+struct ToneTable(Vec<f32>);
+
+impl ToneTable {
+    /// Steps per unit of the square root of the signal, where the curve is nearly straight.
+    const STEPS: f32 = 1024.0;
+
+    fn new() -> Self {
+        Self((0..=(2.0 * Self::STEPS) as usize + 1).map(|i| tone((i as f32 / Self::STEPS).powi(2))).collect())
+    }
+
+    fn at(&self, v: f32) -> f32 {
+        let place = (v.max(0.0).sqrt() * Self::STEPS).min((self.0.len() - 2) as f32);
+        let (i, share) = (place as usize, place.fract());
+        self.0[i] + (self.0[i + 1] - self.0[i]) * share
+    }
+}
+
 /// Makes the photograph. `salt` seeds the noise of this frame.
 pub(crate) fn develop(radiance: &Image<Vec3>, development: &Development, salt: u32) -> RgbImage {
     let size = radiance.size();
+    // A smaller photograph is a full one, averaged.
     let scale = size.width.max(size.height) as f32 / 1920.0;
-    let image = blurred(radiance, (BLUR_PX * scale).max(0.35));
-    let soft = blurred(&image, (SHARPEN_PX * scale).max(0.7));
     let half = Vec3::new(size.width as f32, size.height as f32, 0.0) * 0.5;
     let gain = development.white_balance * development.exposure;
-    let mut out = Image::filled(size, [0u8; 3]);
-    out.data_mut().par_chunks_mut(size.width).enumerate().for_each(|(y, row)| {
+    let mut signal = Image::filled(size, Vec3::ZERO);
+    signal.data_mut().par_chunks_mut(size.width).enumerate().for_each(|(y, row)| {
         for (x, pixel) in row.iter_mut().enumerate() {
             let off = (Vec3::new(x as f32, y as f32, 0.0) - half) / half.length();
-            let (here, around) = (image[(x, y)], soft[(x, y)]);
-            let sharp = (here + (here - around) * SHARPEN).max(here * 0.3);
-            let signal = sharp * gain * (1.0 - VIGNETTE * off.length_squared());
+            *pixel = radiance[(x, y)] * gain * (1.0 - VIGNETTE * off.length_squared());
             for c in 0..3 {
-                let deviation = (READ * READ + SHOT * signal[c].max(0.0)).sqrt();
-                let noisy = signal[c] + deviation * gaussian(hash(x as i32, y as i32, salt ^ (c as u32 + 1)));
-                pixel[c] = (255.0 * tone(noisy) + 0.5).clamp(0.0, 255.0) as u8;
+                let deviation = scale.min(1.5) * (READ * READ + SHOT * pixel[c].max(0.0)).sqrt();
+                pixel[c] += deviation * gaussian(hash(x as i32, y as i32, salt ^ (c as u32 + 1)));
             }
         }
+    });
+    let mut display = blurred(&signal, (BLUR_PX * scale).max(0.3));
+    let table = ToneTable::new();
+    display.data_mut().par_iter_mut().for_each(|p| *p = Vec3::new(table.at(p.x), table.at(p.y), table.at(p.z)));
+    let bright = display.map(|p| luminance(*p));
+    let soft = blurred(&bright, (SHARPEN_PX * scale).max(0.6));
+    let mut out = Image::filled(size, [0u8; 3]);
+    out.data_mut().par_iter_mut().enumerate().for_each(|(i, pixel)| {
+        let crisp = display.data()[i] + SHARPEN * (bright.data()[i] - soft.data()[i]);
+        *pixel = crisp.to_array().map(|v| (255.0 * v + 0.5).clamp(0.0, 255.0) as u8);
     });
     out
 }

@@ -11,25 +11,32 @@
 //! - The same options and model give the same bytes, whatever the number of threads. One frame is in memory at a
 //!   time, and a stopped run is taken up where it ended.
 //!
-//! Limits: one static, opaque, plastic model; no lens distortion and no rolling shutter (the phone's software removes
-//! the first, and the paper's captures are slow enough for the second).
+//! Limits: one static, opaque, plastic model. Lens distortion and rolling shutter are off unless asked for: the phone's
+//! software removes the first, and the paper's captures are slow enough for the second.
 
+mod board;
 mod clicks;
 mod develop;
 mod drift;
+mod lens;
 mod lidar;
 mod light;
 mod options;
 mod orbit;
 mod photo;
+mod plastic;
 mod probes;
 mod random;
 mod sequence;
 mod stage;
+mod statistics;
 mod texture;
+mod walk;
 
-pub use options::{DriftOptions, Quality, SimulateOptions, Table};
+pub use options::{DriftOptions, LensOptions, Quality, SimulateOptions, Table};
 pub use sequence::{SimulateSummary, simulate};
+pub use statistics::PhotoStatistics;
+pub use walk::Walk;
 
 /// Streams of random numbers, one for each thing that is random. Those of frames begin at multiples of 2^32.
 mod streams {
@@ -41,6 +48,9 @@ mod streams {
     pub const PLACE: u64 = 6;
     pub const EXPOSURE: u64 = 7;
     pub const PHOTO: u64 = 8;
+    pub const BOARD: u64 = 10;
+    /// Under seeds of its own: the draws that the drift is calibrated on are the same for every sequence.
+    pub const CALIBRATION: u64 = 9;
     pub const CLICKS: u64 = 1 << 32;
     pub const LIDAR: u64 = 2 << 32;
 }

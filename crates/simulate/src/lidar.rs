@@ -15,7 +15,8 @@ use nalgebra::{Matrix3, Point2, Vector3};
 use rand::RngExt;
 use rayon::prelude::*;
 
-use crate::random::{noise3, normal};
+use crate::develop::blurred;
+use crate::random::{hash, noise, noise3, normal};
 use crate::stage::{Stage, vec3};
 use crate::streams;
 
@@ -26,8 +27,10 @@ const DOTS: (usize, usize) = (28, 21);
 /// Standard deviation of a dot's momentary error, metres, at any indoor distance.
 const JITTER_M: f64 = 0.003;
 /// Amplitude of errors that belong to the surface, metres, and their size in space.
-const SURFACE_M: f64 = 0.004;
-const SURFACE_SIZE_M: f32 = 0.04;
+const SURFACE_M: f64 = 0.0065;
+const SURFACE_SIZE_M: f32 = 0.05;
+/// Doubt where no dot speaks.
+const NO_TRUST: f32 = 2.0;
 /// Range beyond which a dot returns nothing.
 const RANGE_M: f64 = 5.0;
 
@@ -64,7 +67,7 @@ pub(crate) fn measure(
     let guide = shrink(photo, size);
     let mut rng = rng(seed, streams::LIDAR + frame);
     // The scale of a frame is off by a little, as a whole.
-    let frame_scale = 1.0 + 0.004 * normal(&mut rng);
+    let frame_scale = 1.0 + 0.005 * normal(&mut rng);
 
     let (columns, rows) = if size.width >= size.height { DOTS } else { (DOTS.1, DOTS.0) };
     let pitch = (size.width as f64 / columns as f64, size.height as f64 / rows as f64);
@@ -116,7 +119,7 @@ pub(crate) fn measure(
             });
         }
     }
-    spread_out(&dots, &guide, size, pitch.0)
+    spread_out(&dots, &guide, size, pitch.0, hash(frame as i32, seed as i32, 91))
 }
 
 /// The photograph, averaged to the size of the depth map, 0 to 1.
@@ -140,7 +143,7 @@ fn shrink(photo: &RgbImage, size: ImageSize) -> Image<Vec3> {
 }
 
 /// Fills the depth map from the dots.
-fn spread_out(dots: &[Dot], guide: &Image<Vec3>, size: ImageSize, pitch: f64) -> (DepthImage, Confidence) {
+fn spread_out(dots: &[Dot], guide: &Image<Vec3>, size: ImageSize, pitch: f64, salt: u32) -> (DepthImage, Confidence) {
     // Dots by cell of one pitch, so that a pixel looks at its neighbourhood alone.
     let cells = (size.width as f64 / pitch).ceil() as usize + 1;
     let cell_rows = (size.height as f64 / pitch).ceil() as usize + 1;
@@ -149,7 +152,7 @@ fn spread_out(dots: &[Dot], guide: &Image<Vec3>, size: ImageSize, pitch: f64) ->
     for (i, dot) in dots.iter().enumerate() {
         by_cell[cell(dot.pixel.1, cell_rows) * cells + cell(dot.pixel.0, cells)].push(i);
     }
-    let filled: Vec<(f32, u8)> = (0..size.pixels())
+    let filled: Vec<(f32, f32)> = (0..size.pixels())
         .into_par_iter()
         .map(|i| {
             let (x, y) = ((i % size.width) as f64, (i / size.width) as f64);
@@ -164,9 +167,9 @@ fn spread_out(dots: &[Dot], guide: &Image<Vec3>, size: ImageSize, pitch: f64) ->
                         let dot = &dots[d];
                         let (dx, dy) = ((dot.pixel.0 - x) / pitch, (dot.pixel.1 - y) / pitch);
                         let off_color = f64::from((dot.color - color).length());
-                        // Colour guides, but cannot cut: a tenth of the weight always stays.
-                        let alike = 0.1 + 0.9 * (-0.5 * (off_color / 0.12).powi(2)).exp();
-                        let weight = (-0.5 * (dx * dx + dy * dy) / (0.85 * 0.85)).exp() * alike;
+                        // Colour guides, but cannot cut: some of the weight always stays.
+                        let alike = 0.08 + 0.92 * (-0.5 * (off_color / 0.12).powi(2)).exp();
+                        let weight = (-0.5 * (dx * dx + dy * dy) / (0.95 * 0.95)).exp() * alike;
                         let row = Vector3::new(1.0, dx, dy);
                         normal_matrix += row * row.transpose() * weight;
                         right += row * (weight * dot.inverse_depth);
@@ -179,7 +182,7 @@ fn spread_out(dots: &[Dot], guide: &Image<Vec3>, size: ImageSize, pitch: f64) ->
                 }
             }
             if total < 0.05 {
-                return (0.0, 0);
+                return (0.0, NO_TRUST);
             }
             mean /= total;
             let deviation = (square / total - mean * mean).max(0.0).sqrt();
@@ -190,22 +193,24 @@ fn spread_out(dots: &[Dot], guide: &Image<Vec3>, size: ImageSize, pitch: f64) ->
             // Never beyond what the dots saw.
             let inverse_depth = fitted.clamp(mean - 1.5 * deviation, mean + 1.5 * deviation);
             let (spread, strength) = (spread / total, strength / total);
+            // Towards the border fewer and fewer dots speak.
             let border = x.min(y).min(size.width as f64 - 1.0 - x).min(size.height as f64 - 1.0 - y) / pitch;
-            let doubt =
-                spread * 6.0 + deviation / mean * 2.0 + (0.05 / strength.max(0.01)).min(1.0) + (0.5 - border).max(0.0);
-            let confidence = if doubt < 0.65 {
-                2
-            } else if doubt < 1.1 {
-                1
-            } else {
-                0
-            };
-            ((1.0 / inverse_depth.max(1e-3)) as f32, confidence)
+            let fray = 0.7 * f64::from(noise((x / pitch) as f32, (y / pitch) as f32, salt));
+            let doubt = spread * 6.0
+                + deviation / mean * 2.0
+                + (0.02 / strength.max(0.004)).min(1.0)
+                + 1.6 * (0.35 + fray - border).max(0.0);
+            ((1.0 / inverse_depth.max(1e-3)) as f32, doubt as f32)
         })
         .collect();
-    let (depth, confidence) = filled.into_iter().unzip();
-    (
-        DepthImage::from_data(size, depth).expect("one depth for each pixel"),
-        Confidence::from_data(size, confidence).expect("one confidence for each pixel"),
-    )
+    let (depth, doubt): (Vec<f32>, Vec<f32>) = filled.into_iter().unzip();
+    let doubt = Image::from_data(size, doubt).expect("one doubt for each pixel");
+    // Trust is decided by regions, not by pixels.
+    let confidence = blurred(&doubt, 0.2 * pitch as f32).map(|doubt| match doubt {
+        d if *d < 0.65 => 2,
+        d if *d < 1.1 => 1,
+        _ => 0,
+    });
+    let depth = DepthImage::from_data(size, depth).expect("one depth for each pixel");
+    (depth, confidence)
 }

@@ -48,9 +48,11 @@ pub(crate) struct Orbit {
     center_in_object: Point3<f64>,
     /// Mean distance to the object's middle.
     pub radius_m: f64,
-    /// Time from the first to the last frame.
-    pub duration_s: f64,
+    /// Time for all circles.
+    circles_s: f64,
     frames: usize,
+    frames_per_s: Option<f64>,
+    jitter: f64,
     distance: Wobble,
     height: Wobble,
     target: [Wobble; 3],
@@ -75,8 +77,10 @@ impl Orbit {
             first_azimuth_rad: 0.0,
             center_in_object: bounds_in_object.center(),
             radius_m: NEAREST_M,
-            duration_s: 0.0,
+            circles_s: 0.0,
             frames: options.frames,
+            frames_per_s: options.frames_per_s,
+            jitter: options.hand_jitter,
             distance: wobble(0.03, 0.5),
             height: wobble(0.03, 0.5),
             target: [wobble(0.05, 1.0), wobble(0.05, 1.0), wobble(0.05, 1.0)],
@@ -101,31 +105,40 @@ impl Orbit {
     fn set_radius(&mut self, radius_m: f64) {
         self.radius_m = radius_m;
         let turn_m: f64 = self.elevations_rad.iter().map(|e| TAU * radius_m * e.cos()).sum();
-        self.duration_s = turn_m / SPEED_M_PER_S;
+        self.circles_s = turn_m / SPEED_M_PER_S;
     }
 
     /// When frame `index` is taken, seconds after the first.
     pub fn time_s(&self, index: usize) -> f64 {
-        self.duration_s * index as f64 / self.frames as f64
+        match self.frames_per_s {
+            Some(rate) => index as f64 / rate,
+            None => self.circles_s * index as f64 / self.frames as f64,
+        }
+    }
+
+    /// Distance from the camera to the object's middle.
+    pub fn distance_m(&self, t_s: f64) -> f64 {
+        self.radius_m * (1.0 + 0.04 * (self.jitter * self.distance.at(t_s)).clamp(-2.5, 2.5))
     }
 
     /// The true pose of the camera.
     pub fn object_from_cam(&self, t_s: f64) -> Rigid3<Object, Camera> {
         let circles = self.elevations_rad.len();
-        let along = (t_s / self.duration_s * circles as f64).clamp(0.0, circles as f64 - 1e-9);
-        let circle = along as usize;
+        let along = t_s / self.circles_s * circles as f64;
+        // Who has walked all circles goes on along the last.
+        let circle = (along.max(0.0) as usize).min(circles - 1);
         // The last fifth of each circle climbs to the next.
         let climb = ((along - circle as f64 - 0.8) / 0.2).clamp(0.0, 1.0);
         let climb = climb * climb * (3.0 - 2.0 * climb);
         let next = self.elevations_rad[(circle + 1).min(circles - 1)];
         let elevation = self.elevations_rad[circle] * (1.0 - climb) + next * climb;
-        let elevation = (elevation + 0.03 * self.height.at(t_s)).min(1.52);
+        let elevation = (elevation + 0.03 * self.jitter * self.height.at(t_s)).min(1.52);
         let azimuth = self.first_azimuth_rad + TAU * along;
-        let distance = self.radius_m * (1.0 + 0.04 * self.distance.at(t_s).clamp(-2.5, 2.5));
+        let distance = self.distance_m(t_s);
         let outward = Vector3::new(elevation.cos() * azimuth.cos(), elevation.sin(), elevation.cos() * azimuth.sin());
         let center = self.center_in_object + outward * distance;
 
-        let sway = Vector3::from_fn(|i, _| self.target[i].at(t_s)) * (0.02 * self.radius_m);
+        let sway = Vector3::from_fn(|i, _| self.target[i].at(t_s)) * (0.02 * self.jitter * self.radius_m);
         let forward = (self.center_in_object + sway - center).normalize();
         let right = forward.cross(&Vector3::y()).normalize();
         let down = forward.cross(&right);
@@ -136,7 +149,8 @@ impl Orbit {
         } else {
             Matrix3::from_columns(&[right, down, forward])
         };
-        let roll = Rotation3::from_axis_angle(&Vector3::z_axis(), 2.5f64.to_radians() * self.roll.at(t_s));
+        let roll =
+            Rotation3::from_axis_angle(&Vector3::z_axis(), 2.5f64.to_radians() * self.jitter * self.roll.at(t_s));
         let rotation = Rotation3::from_matrix_unchecked(axes) * roll;
         Rigid3::from_parts(UnitQuaternion::from_rotation_matrix(&rotation), center.coords)
     }

@@ -1,29 +1,31 @@
 //! Photographs: what the phone's camera sees of the set.
 //!
 //! A photograph is the mean of a few sharp renderings, shifted by parts of a pixel (which smooths edges) and taken at
-//! different moments of the exposure (which blurs what moves). Each pixel is a diffuse surface under ambient light and the window
-//! with a glossy coat: ABS plastic, refractive index 1.5. Parts touch with visible seams and have rounded edges, which
-//! catch highlights.
+//! different moments of the exposure (which blurs what moves). Each pixel is a diffuse surface under the window, the room
+//! and what other surfaces send on ([`crate::probes`]), below a glossy coat. The coat mirrors the window and the room, and in
+//! the finer efforts also the set, by rays of their own.
 
-use glam::Vec3;
+use glam::{Vec3, Vec4};
 use mb_geometry::{Camera, ImageSize, Intrinsics, Object, Rigid3};
-use mb_image::Image;
-use mb_mesh::TriangleMesh;
-use mb_render::{Raster, View};
-use nalgebra::Point2;
+use mb_image::{DepthImage, Image};
+use mb_render::{NO_TRIANGLE, Raster, View};
 use rayon::prelude::*;
 
 use crate::Quality;
-use crate::light::fresnel;
-use crate::probes::{Probes, Tracing};
-use crate::stage::{Stage, vec3};
+use crate::develop::blurred;
+use crate::lens::{Distortion, Eye};
+use crate::light::{fresnel, visible_facet};
+use crate::probes::{Arriving, Probes, Tracing};
+use crate::random::{hash, unit};
+use crate::stage::{LIFT_M, Stage, Surface};
 
-/// Gap between the walls of two bricks: each side wall stands back by 0.1 mm from the nominal pitch.
-const SEAM_M: f32 = 0.0002;
-/// Radius of a brick's edges.
-const EDGE_M: f32 = 0.00025;
 /// Time that the shutter is open. Indoors by day a phone needs about this much.
 const EXPOSURE_S: f64 = 1.0 / 120.0;
+
+/// Aperture of a phone's lens: a point is blurred over this many pixels of a 1920-pixel-wide photograph for each 1/m that
+/// it is out of focus. A lens 3 mm across and 5 mm long over pixels of 3.7 micrometres makes 4; what phones store is
+/// crisper than that.
+const APERTURE_PX_M: f32 = 1.8;
 
 /// Offsets of the samples within a pixel, in pixels: rotated grids.
 const TWO: [(f64, f64); 2] = [(-0.25, 0.25), (0.25, -0.25)];
@@ -54,7 +56,16 @@ impl Quality {
         match self {
             Self::Draft => Tracing { stride: stride(16), ambient_rays: 6, shadow_rays: 3, shadowed_bounce: false },
             Self::Standard => Tracing { stride: stride(6), ambient_rays: 12, shadow_rays: 6, shadowed_bounce: true },
-            Self::Photo => Tracing { stride: stride(4), ambient_rays: 32, shadow_rays: 16, shadowed_bounce: true },
+            Self::Photo => Tracing { stride: stride(3), ambient_rays: 40, shadow_rays: 20, shadowed_bounce: true },
+        }
+    }
+
+    /// The least share of light mirrored by a coat for which a ray is followed.
+    fn mirrors_from(self) -> f32 {
+        match self {
+            Self::Draft => f32::INFINITY,
+            Self::Standard => 0.04,
+            Self::Photo => 0.01,
         }
     }
 }
@@ -62,10 +73,14 @@ impl Quality {
 /// What a photograph is taken of and with.
 pub(crate) struct Shot<'a> {
     pub stage: &'a Stage,
-    pub model: &'a TriangleMesh,
     pub size: ImageSize,
     pub intrinsics: Intrinsics,
+    pub distortion: Distortion,
+    /// Time from the first line of the sensor to the last, seconds.
+    pub readout_s: f64,
     pub quality: Quality,
+    /// Depth at which everything is sharp, metres.
+    pub focus_m: f32,
     /// Differs from frame to frame.
     pub salt: u32,
 }
@@ -73,107 +88,123 @@ pub(crate) struct Shot<'a> {
 /// Renders the linear radiance `[H, W]` that reaches the sensor. `object_from_cam` is the camera's pose at a time offset
 /// in seconds from the middle of the exposure.
 pub(crate) fn expose(shot: &Shot<'_>, object_from_cam: impl Fn(f64) -> Rigid3<Object, Camera>) -> Image<Vec3> {
-    let view = |k: Intrinsics, at_s: f64| View {
-        intrinsics: k,
-        size: shot.size,
-        cam_from_frame: object_from_cam(at_s).inverse(),
-    };
+    let middle = View { intrinsics: shot.intrinsics, size: shot.size, cam_from_frame: object_from_cam(0.0).inverse() };
     let longer = shot.size.width.max(shot.size.height);
-    let probes = Probes::new(shot.stage, &view(shot.intrinsics, 0.0), shot.quality.tracing(longer), shot.salt);
+    let probes = Probes::new(shot.stage, &middle, shot.quality.tracing(longer), shot.salt);
     let samples = shot.quality.samples();
     let mut sum = Image::filled(shot.size, Vec3::ZERO);
+    let mut depth = None;
     for (i, (dx, dy)) in samples.iter().enumerate() {
         let at_s = ((i as f64 + 0.5) / samples.len() as f64 - 0.5) * EXPOSURE_S;
         let k = shot.intrinsics;
         let shifted = Intrinsics { cx: k.cx - dx, cy: k.cy - dy, ..k };
-        let view = view(shifted, at_s);
-        let raster = shot.stage.scene.render(&view);
-        let pass = Pass { shot, raster: &raster, view: &view, probes: &probes, object_from_cam: object_from_cam(at_s) };
+        let eye = Eye::new(shot.size, shifted, shot.distortion, shot.readout_s, |row_s| object_from_cam(at_s + row_s));
+        let raster = eye.look(shot.stage);
+        let pass = Pass { shot, raster: &raster, eye: &eye, probes: &probes, salt: hash(i as i32, 77, shot.salt) };
         let width = shot.size.width;
         sum.data_mut().par_chunks_mut(width).enumerate().for_each(|(y, row)| {
             for (x, pixel) in row.iter_mut().enumerate() {
                 *pixel += pass.radiance(x, y) / samples.len() as f32;
             }
         });
+        depth.get_or_insert(raster.depth);
     }
-    sum
+    let scale = longer as f32 / 1920.0;
+    match depth {
+        Some(depth) => focused(&sum, &depth, shot.focus_m, scale),
+        None => sum,
+    }
+}
+
+/// Blurs what is out of focus. `scale` is the photograph's width over 1920 pixels.
+///
+/// Each pixel is mixed from a few blurs of the whole image, to which sharp pixels contribute little, so that what is in
+/// focus does not bleed into what is not.
+fn focused(sharp: &Image<Vec3>, depth: &DepthImage, focus_m: f32, scale: f32) -> Image<Vec3> {
+    /// Standard deviations of the blurs, pixels of a 1920-pixel-wide photograph.
+    const LEVELS: [f32; 2] = [0.9, 2.2];
+    // A disc's standard deviation is a quarter of its diameter.
+    let spread = depth.map(|z| {
+        let z = if *z > 0.0 { *z } else { 5.0 };
+        (0.25 * APERTURE_PX_M * (1.0 / z - 1.0 / focus_m).abs()).min(LEVELS[1])
+    });
+    let blurs = LEVELS.map(|level| {
+        let mut weighted = Image::filled(sharp.size(), Vec4::ZERO);
+        weighted.data_mut().par_iter_mut().enumerate().for_each(|(i, out)| {
+            *out = sharp.data()[i].extend(1.0) * (spread.data()[i] / level).clamp(0.02, 1.0);
+        });
+        blurred(&weighted, (level * scale).max(0.3))
+    });
+    let mut out = sharp.clone();
+    out.data_mut().par_iter_mut().enumerate().for_each(|(i, pixel)| {
+        let of = |blur: &Image<Vec4>| blur.data()[i].truncate() / blur.data()[i].w;
+        let spread = spread.data()[i];
+        *pixel = if spread < LEVELS[0] {
+            pixel.lerp(of(&blurs[0]), spread / LEVELS[0])
+        } else {
+            of(&blurs[0]).lerp(of(&blurs[1]), (spread - LEVELS[0]) / (LEVELS[1] - LEVELS[0]))
+        };
+    });
+    out
 }
 
 /// One sharp rendering.
 struct Pass<'a> {
     shot: &'a Shot<'a>,
     raster: &'a Raster,
-    view: &'a View<Object>,
+    eye: &'a Eye,
     probes: &'a Probes<'a>,
-    object_from_cam: Rigid3<Object, Camera>,
+    salt: u32,
 }
 
 impl Pass<'_> {
-    fn place(&self, x: usize, y: usize, z: f32) -> Vec3 {
-        let pixel = Point2::new(x as f64, y as f64);
-        vec3(&(self.object_from_cam * self.view.intrinsics.cam_from_img(&pixel, f64::from(z))))
-    }
-
     fn radiance(&self, x: usize, y: usize) -> Vec3 {
         let stage = self.shot.stage;
-        let z = self.raster.depth[(x, y)];
-        let camera = self.object_from_cam.translation();
-        let camera = Vec3::new(camera.x as f32, camera.y as f32, camera.z as f32);
-        if z <= 0.0 {
-            let towards = self.place(x, y, 1.0) - camera;
-            return stage.light.room(towards.normalize());
-        }
+        let direction = self.eye.direction(x, y);
         let triangle = self.raster.triangle[(x, y)];
-        let place = self.place(x, y, z);
-        let view = (camera - place).normalize();
-        let mut surface = stage.surface(triangle, place, view, z / self.view.intrinsics.fx as f32);
-        let arriving = self.probes.at(x as f32, y as f32, place, stage.normal(triangle, place, view));
-        let mut seam = 0.0;
-        if stage.is_model(triangle) {
-            seam = self.round_edges(x, y, triangle, place, view, &mut surface.normal);
+        if triangle == NO_TRIANGLE {
+            let d = direction.normalize();
+            return stage.light.room(d, 0.01) + stage.light.panes(d, 0.005);
         }
-        let light = &stage.light;
-        let facing = surface.normal.dot(light.window).max(0.0);
-        let diffuse = surface.finish.albedo * (arriving.ambient + light.window_strength * (facing * arriving.window));
-        let mirrored = 2.0 * surface.normal.dot(view) * surface.normal - view;
-        // The room in the coat, dimmed where the surface sees little of the room.
-        let openness = (arriving.ambient.y / light.room(surface.normal).y).min(1.0);
-        let rough = surface.finish.roughness;
-        let coat = light.room(mirrored) * (fresnel(surface.normal.dot(view)) * (1.0 - 0.7 * rough) * openness);
-        let highlight = light.highlight(surface.normal, view, rough) * arriving.window;
-        (diffuse * 0.96 + coat + highlight) * (1.0 - 0.75 * seam)
-    }
-
-    /// Rounds `normal` towards the neighbouring facets of the same part, and returns how much of the pixel is the gap
-    /// to another part, 0 to 1.
-    fn round_edges(&self, x: usize, y: usize, triangle: u32, place: Vec3, view: Vec3, normal: &mut Vec3) -> f32 {
-        let stage = self.shot.stage;
-        let own_part = stage.part(self.shot.model, triangle);
         let z = self.raster.depth[(x, y)];
-        let pixel_m = z / self.view.intrinsics.fx as f32;
-        let flat = *normal;
-        let mut seam = 0.0f32;
-        let neighbours = [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)];
-        for (nx, ny) in neighbours {
-            let Some(&other) = self.raster.triangle.get(nx, ny) else { continue };
-            if other == triangle || other == u32::MAX {
-                continue;
-            }
-            let beside = self.place(nx, ny, self.raster.depth[(nx, ny)]);
-            // Surfaces that do not touch are a silhouette: no seam and no common edge.
-            if (beside - place).length() > 4.0 * pixel_m + 1.5 * SEAM_M {
-                continue;
-            }
-            if stage.part(self.shot.model, other) != own_part {
-                seam = seam.max((0.5 * SEAM_M / pixel_m).min(1.0));
-            } else {
-                let turned = stage.normal(other, beside, view);
-                if turned.dot(flat) < 0.85 {
-                    *normal += turned * (0.8 * EDGE_M / pixel_m).min(1.0);
-                }
-            }
-        }
-        *normal = normal.normalize();
-        seam
+        let place = self.eye.place(x, y) + direction * z;
+        let view = -direction.normalize();
+        let surface = stage.surface(triangle, place, view, z / self.eye.focal_px());
+        let arriving = self.probes.at(place, stage.normal(triangle, place, view));
+        let noise = hash(x as i32, y as i32, self.salt);
+        shade(stage, &surface, place, view, arriving, self.shot.quality.mirrors_from(), noise)
     }
+}
+
+/// Radiance that a surface sends towards `view`, for the light that arrives there. A ray is followed for what its coat
+/// mirrors where that is at least `mirrors_from` of the light.
+fn shade(
+    stage: &Stage,
+    surface: &Surface,
+    place: Vec3,
+    view: Vec3,
+    arriving: Arriving,
+    mirrors_from: f32,
+    noise: u32,
+) -> Vec3 {
+    let (light, finish, normal) = (&stage.light, &surface.finish, surface.normal);
+    let facing = normal.dot(light.window).max(0.0);
+    let straight = finish.coat * fresnel(normal.dot(view));
+    let below = (1.0 - straight) * (1.0 - finish.coat * 0.05);
+    let diffuse = finish.albedo * (arriving.ambient + light.window_strength * (facing * arriving.window)) * below;
+    let alpha = finish.roughness * finish.roughness;
+    let coat = if straight >= mirrors_from {
+        let facet = visible_facet(normal, view, alpha, (unit(noise), unit(noise.rotate_left(16) ^ 0x5A5A)));
+        let towards = 2.0 * facet.dot(view) * facet - view;
+        let share = finish.coat * fresnel(facet.dot(view));
+        let glimpse = stage.glimpse(place + normal * LIFT_M, towards, false, 0.02 + 0.5 * alpha);
+        let panes = if glimpse.free { light.panes(towards, 0.5 * alpha) } else { Vec3::ZERO };
+        (glimpse.radiance + panes) * share
+    } else {
+        // Rough surfaces mirror less at a slant than smooth ones, and what stands round a place hides the room from it.
+        let towards = 2.0 * normal.dot(view) * normal - view;
+        let room = light.room(towards, alpha) * (1.0 - 0.7 * alpha) * arriving.open;
+        (room + light.panes(towards, alpha) * arriving.window) * straight
+    };
+    (diffuse + coat) * (1.0 - 0.8 * surface.gap)
 }

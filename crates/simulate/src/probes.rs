@@ -7,15 +7,15 @@
 use std::f32::consts::PI;
 
 use glam::Vec3;
-use mb_geometry::{Object, Ray, Rigid3};
+use mb_geometry::{Intrinsics, Object, Rigid3};
 use mb_image::Image;
 use mb_render::View;
-use nalgebra::{Point3, Vector3};
+use nalgebra::Point3;
 use rayon::prelude::*;
 
 use crate::light::tangents;
 use crate::random::{hash, unit};
-use crate::stage::Stage;
+use crate::stage::{LIFT_M, REACH_M, Stage, ray};
 
 /// How finely light is traced.
 #[derive(Debug, Clone, Copy)]
@@ -35,6 +35,8 @@ pub(crate) struct Tracing {
 pub(crate) struct Arriving {
     /// Irradiance from the room and from other surfaces, divided by pi.
     pub ambient: Vec3,
+    /// Share of the half space that leads out of the set, weighted like irradiance, 0 to 1.
+    pub open: f32,
     /// Share of the window that is seen, 0 to 1.
     pub window: f32,
 }
@@ -52,22 +54,10 @@ struct Probe {
 pub(crate) struct Probes<'a> {
     stage: &'a Stage,
     tracing: Tracing,
+    /// The camera that sees probe `(i, j)` at pixel `(i, j)`.
+    view: View<Object>,
     probes: Image<Probe>,
     salt: u32,
-}
-
-/// Rays end here: further surfaces count as part of the room.
-const REACH_M: f64 = 0.8;
-
-/// Detail of surfaces that light bounces off: finer would be noise.
-const BOUNCE_DETAIL_M: f32 = 0.005;
-
-fn ray(from: Vec3, normal: Vec3, towards: Vec3) -> Ray {
-    let start = from + normal * 3e-5;
-    Ray {
-        origin: Point3::new(f64::from(start.x), f64::from(start.y), f64::from(start.z)),
-        direction: Vector3::new(f64::from(towards.x), f64::from(towards.y), f64::from(towards.z)),
-    }
 }
 
 /// Point `i` of `n` of a rotated Fibonacci lattice in the unit square: even coverage for any small n.
@@ -79,45 +69,35 @@ fn lattice(i: u32, n: u32, turn: (f32, f32)) -> (f32, f32) {
 }
 
 /// Traces the light that arrives at a point; `noise` decorrelates the rays of different points.
-fn trace(stage: &Stage, tracing: Tracing, place: Vec3, normal: Vec3, noise: u32) -> Arriving {
+pub(crate) fn trace(stage: &Stage, tracing: Tracing, place: Vec3, normal: Vec3, noise: u32) -> Arriving {
     let turn = (unit(noise), unit(hash(noise as i32, 1, 2)));
     let (a, b) = tangents(normal);
     let light = &stage.light;
-    let mut ambient = Vec3::ZERO;
+    let start = place + normal * LIFT_M;
+    // Each ray stands for its share of the half space.
+    let blur = (2.0 / tracing.ambient_rays as f32).sqrt();
+    let (mut ambient, mut open) = (Vec3::ZERO, 0.0);
     for i in 0..tracing.ambient_rays {
         let (u, v) = lattice(i, tracing.ambient_rays, turn);
         let (sin, cos) = (2.0 * PI * v).sin_cos();
         let towards = (a * cos + b * sin) * u.sqrt() + normal * (1.0 - u).sqrt();
-        let cast = ray(place, normal, towards);
-        let Some(hit) = stage.bvh.cast(&cast, REACH_M) else {
-            ambient += light.room(towards);
-            continue;
-        };
-        // One bounce: what that surface sends on of the window's light, and of a typical share of the room's.
-        let p = place + towards * hit.t as f32;
-        let surface = stage.surface(hit.triangle, p, -towards, BOUNCE_DETAIL_M);
-        let facing = surface.normal.dot(light.window).max(0.0);
-        let lit = if facing <= 0.0 {
-            0.0
-        } else if tracing.shadowed_bounce {
-            if stage.bvh.occluded(&ray(p, surface.normal, light.window), REACH_M) { 0.0 } else { facing }
-        } else {
-            0.6 * facing
-        };
-        ambient += surface.finish.albedo * (light.window_strength * lit + light.room(surface.normal) * 0.5);
+        let glimpse = stage.glimpse(start, towards, tracing.shadowed_bounce, 0.3 * blur);
+        ambient += glimpse.radiance;
+        open += f32::from(u8::from(glimpse.free));
     }
     let mut seen = 0.0;
     // Towards the window from behind: no ray needed.
-    if normal.dot(light.window) > -light.window_radius_rad.sin() {
+    if light.may_light(normal) {
         for i in 0..tracing.shadow_rays {
             let (u, v) = lattice(i, tracing.shadow_rays, (turn.1, turn.0));
             let towards = light.towards_window(u, v);
-            if normal.dot(towards) > 0.0 && !stage.bvh.occluded(&ray(place, normal, towards), REACH_M) {
+            if normal.dot(towards) > 0.0 && !stage.bvh.occluded(&ray(start, towards), REACH_M) {
                 seen += 1.0;
             }
         }
     }
-    Arriving { ambient: ambient / tracing.ambient_rays as f32, window: seen / tracing.shadow_rays as f32 }
+    let rays = tracing.ambient_rays as f32;
+    Arriving { ambient: ambient / rays, open: open / rays, window: seen / tracing.shadow_rays as f32 }
 }
 
 impl<'a> Probes<'a> {
@@ -130,7 +110,7 @@ impl<'a> Probes<'a> {
         // Probe (i, j) lies at pixel (i, j) * stride exactly.
         let s = tracing.stride as f64;
         let k = view.intrinsics;
-        let intrinsics = mb_geometry::Intrinsics { fx: k.fx / s, fy: k.fy / s, cx: k.cx / s, cy: k.cy / s };
+        let intrinsics = Intrinsics { fx: k.fx / s, fy: k.fy / s, cx: k.cx / s, cy: k.cy / s };
         let coarse = View { intrinsics, size: coarse_size, cam_from_frame: view.cam_from_frame };
         let raster = stage.scene.render(&coarse);
         let object_from_cam: Rigid3<Object, _> = view.cam_from_frame.inverse();
@@ -155,7 +135,7 @@ impl<'a> Probes<'a> {
             })
             .collect();
         let traced = Image::from_data(coarse_size, traced).expect("one probe for each coarse pixel");
-        let mut probes = Self { stage, tracing, probes: traced, salt };
+        let mut probes = Self { stage, tracing, view: coarse, probes: traced, salt };
         probes.filter();
         probes
     }
@@ -169,7 +149,7 @@ impl<'a> Probes<'a> {
             .map(|i| {
                 let (x, y) = (i % size.width, i / size.width);
                 let mut probe = old[(x, y)];
-                let (mut sum, mut window, mut total) = (Vec3::ZERO, 0.0, 0.0);
+                let (mut sum, mut open, mut window, mut total) = (Vec3::ZERO, 0.0, 0.0, 0.0);
                 for ny in y.saturating_sub(2)..(y + 3).min(size.height) {
                     for nx in x.saturating_sub(2)..(x + 3).min(size.width) {
                         let other = &old[(nx, ny)];
@@ -177,6 +157,7 @@ impl<'a> Probes<'a> {
                         // Shadows keep their edges: half the reach.
                         let near = nx.abs_diff(x) <= 1 && ny.abs_diff(y) <= 1;
                         sum += other.arriving.ambient * weight;
+                        open += other.arriving.open * weight;
                         total += weight;
                         if near {
                             window += other.arriving.window * weight;
@@ -191,7 +172,7 @@ impl<'a> Probes<'a> {
                     })
                     .sum();
                 if total > 0.0 && near_total > 0.0 {
-                    probe.arriving = Arriving { ambient: sum / total, window: window / near_total };
+                    probe.arriving = Arriving { ambient: sum / total, open: open / total, window: window / near_total };
                 }
                 probe
             })
@@ -199,27 +180,29 @@ impl<'a> Probes<'a> {
         self.probes = Image::from_data(size, filtered).expect("as many probes as before");
     }
 
-    /// The light at `place` with `normal`, seen at photograph pixel `(x, y)`.
-    pub fn at(&self, x: f32, y: f32, place: Vec3, normal: Vec3) -> Arriving {
+    /// The light at `place` with `normal`.
+    pub fn at(&self, place: Vec3, normal: Vec3) -> Arriving {
         let size = self.probes.size();
-        let s = self.tracing.stride as f32;
-        let (u, v) = ((x / s).max(0.0), (y / s).max(0.0));
+        let in_frame = Point3::new(f64::from(place.x), f64::from(place.y), f64::from(place.z));
+        let pixel = self.view.intrinsics.img_from_cam(&(self.view.cam_from_frame * in_frame));
+        let (u, v) = pixel.map_or((0.0, 0.0), |p| ((p.x as f32).max(0.0), (p.y as f32).max(0.0)));
         let (i, j) = ((u as usize).min(size.width - 2), (v as usize).min(size.height - 2));
-        let (fu, fv) = (u - i as f32, v - j as f32);
-        let (mut ambient, mut window, mut total) = (Vec3::ZERO, 0.0, 0.0);
+        let (fu, fv) = ((u - i as f32).min(1.0), (v - j as f32).min(1.0));
+        let (mut sum, mut total) = (Arriving::default(), 0.0);
         for (di, wu) in [(0, 1.0 - fu), (1, fu)] {
             for (dj, wv) in [(0, 1.0 - fv), (1, fv)] {
                 let probe = &self.probes[(i + di, j + dj)];
                 let weight = (wu * wv).max(0.01) * affinity(probe, place, normal);
-                ambient += probe.arriving.ambient * weight;
-                window += probe.arriving.window * weight;
+                sum.ambient += probe.arriving.ambient * weight;
+                sum.open += probe.arriving.open * weight;
+                sum.window += probe.arriving.window * weight;
                 total += weight;
             }
         }
         if total > 0.02 {
-            return Arriving { ambient: ambient / total, window: window / total };
+            return Arriving { ambient: sum.ambient / total, open: sum.open / total, window: sum.window / total };
         }
-        trace(self.stage, self.tracing, place, normal, hash((x * 4.0) as i32, (y * 4.0) as i32, self.salt))
+        trace(self.stage, self.tracing, place, normal, hash((u * 64.0) as i32, (v * 64.0) as i32, self.salt))
     }
 }
 

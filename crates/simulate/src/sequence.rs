@@ -5,21 +5,20 @@ use std::path::Path;
 use mb_capture::{
     Alignment, AlignmentStage, FrameAlignment, FrameId, Keypoints, SequenceMeta, write_intrinsics_txt, write_pose_txt,
 };
-use mb_geometry::{Camera, Object, Rigid3, World};
-use mb_job::{InputError, Progress, Result, Steps, rng, write_atomic};
+use mb_geometry::{Board, Object, Rigid3};
+use mb_job::{InputError, Progress, Result, Steps, write_atomic};
 use mb_mesh::TriangleMesh;
-use nalgebra::{Point3, UnitQuaternion, Vector3};
-use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::clicks::{ClickView, click};
 use crate::develop::{Development, develop, developments};
-use crate::drift::{drift, pairwise_error};
+use crate::lens::Distortion;
 use crate::lidar;
 use crate::orbit::Orbit;
 use crate::photo::{Shot, expose};
 use crate::stage::Stage;
+use crate::walk::Walk;
 use crate::{SimulateOptions, Table, streams};
 
 /// What was simulated.
@@ -57,6 +56,16 @@ struct Plan {
     model_sha256: String,
 }
 
+/// `simulation/board.json`: the board under the model.
+#[derive(Debug, Serialize)]
+struct BoardRecord {
+    version: u32,
+    /// What was asked for.
+    board: String,
+    object_from_board: Rigid3<Object, Board>,
+}
+
+const BOARD: &str = "simulation/board.json";
 const PLAN: &str = "simulation/plan.json";
 const JPEG_QUALITY: u8 = 95;
 
@@ -106,19 +115,6 @@ fn claim(out: &Path, plan: &Plan) -> Result<()> {
     write_atomic(path, &to_json(plan))
 }
 
-/// Where the object stands in the phone's world: some way off the place where the session began, turned, upright up
-/// to the error of the phone's gravity.
-fn place_object(seed: u64, radius_m: f64) -> Rigid3<World, Object> {
-    let mut rng = rng(seed, streams::PLACE);
-    let heading = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), rng.random_range(0.0..std::f64::consts::TAU));
-    let mut tilt = || rng.random_range(-0.4..0.4f64).to_radians();
-    let lean = UnitQuaternion::from_euler_angles(tilt(), 0.0, tilt());
-    let towards = rng.random_range(0.0..std::f64::consts::TAU);
-    let reach = radius_m * rng.random_range(0.8..1.2);
-    let place = Vector3::new(reach * towards.cos(), -0.7 * radius_m, reach * towards.sin());
-    Rigid3::from_parts(lean * heading, place)
-}
-
 /// Simulates a hand-held phone's capture of `model` (object frame, metres; y up, standing on its lowest point) and
 /// writes it to `out` as a sequence folder, `docs/formats.md` file by file.
 ///
@@ -144,16 +140,9 @@ pub fn simulate(
     };
     claim(out, &plan)?;
 
-    // The path, as it was and as the phone reports it.
     let bounds = model.bounds();
-    let orbit = Orbit::new(options, &bounds);
-    let world_from_object = place_object(options.seed, orbit.radius_m);
-    let times: Vec<f64> = (0..options.frames).map(|i| orbit.time_s(i)).collect();
-    let truth: Vec<Rigid3<World, Camera>> =
-        times.iter().map(|t| world_from_object * orbit.object_from_cam(*t)).collect();
-    let middle: Point3<f64> = world_from_object * bounds.center();
-    let reported = drift(&truth, &middle, &options.drift, options.seed);
-    let error = pairwise_error(&truth, &reported);
+    let walk = Walk::new(&bounds, options)?;
+    let orbit = &walk.orbit;
 
     let mut warnings = Vec::new();
     if !orbit.sees_all(&bounds) {
@@ -166,31 +155,22 @@ pub fn simulate(
         ));
     }
 
-    if error.translation_rmse_m > 1.05e-3 * options.drift.translation_rmse_mm && options.drift.translation_rmse_mm > 0.0
-    {
-        warnings.push(format!(
-            "the reported poses stray by {:.2} mm, more than asked: the asked rotations, seen from {:.2} m, make that much",
-            error.translation_rmse_m * 1e3,
-            orbit.radius_m
-        ));
-    }
-
-    let kept = photograph(&stage, model, options, &orbit, out, progress)?;
-    for (i, ((t, truth), reported)) in times.iter().zip(&truth).zip(&reported).enumerate() {
+    let kept = photograph(&stage, options, orbit, out, progress)?;
+    for i in 0..options.frames {
         let name = format!("{}.txt", FrameId(i as u32));
-        let intrinsics = orbit.intrinsics(*t);
-        write_intrinsics_txt(out.join("intrinsic").join(&name), &intrinsics)?;
-        write_intrinsics_txt(out.join("simulation/intrinsic").join(&name), &intrinsics)?;
-        write_pose_txt(out.join("pose").join(&name), reported)?;
-        write_pose_txt(out.join("simulation/pose").join(&name), truth)?;
+        write_intrinsics_txt(out.join("intrinsic").join(&name), &walk.intrinsics[i])?;
+        write_intrinsics_txt(out.join("simulation/intrinsic").join(&name), &walk.intrinsics[i])?;
+        write_pose_txt(out.join("pose").join(&name), &walk.reported_world_from_cam[i])?;
+        write_pose_txt(out.join("simulation/pose").join(&name), &walk.true_world_from_cam[i])?;
     }
     let alignment = Alignment {
         version: 1,
         stage: AlignmentStage::Truth,
-        world_from_object,
+        world_from_object: walk.world_from_object,
         object_covariance: None,
         rms_px: None,
-        frames: truth
+        frames: walk
+            .true_world_from_cam
             .iter()
             .enumerate()
             .map(|(i, pose)| FrameAlignment {
@@ -203,7 +183,12 @@ pub fn simulate(
     };
     alignment.write(out.join("simulation/alignment.json"))?;
 
-    let keypoints = annotate(&stage, model, options, &orbit, progress)?;
+    if let (Some(board), Some(print)) = (&options.board, &stage.board) {
+        let record = BoardRecord { version: 1, board: board.clone(), object_from_board: print.object_from_board };
+        write_atomic(out.join(BOARD), &to_json(&record))?;
+    }
+
+    let keypoints = annotate(&stage, model, options, orbit, progress)?;
     if keypoints.keypoints.len() < options.keypoints {
         warnings.push(format!(
             "only {} of {} keypoints could be clicked: the model shows few corners",
@@ -219,7 +204,7 @@ pub fn simulate(
         image_size: options.size,
         device: "simulated phone".to_owned(),
         source: "mobilebrick capture simulate".to_owned(),
-        frame_times_s: Some(times),
+        frame_times_s: Some(walk.times_s.clone()),
         hashes_sha256: None,
         provenance: serde_json::to_value(&plan).expect("plain data with string keys"),
     };
@@ -231,8 +216,8 @@ pub fn simulate(
         radius_m: orbit.radius_m,
         table: stage.table_kind,
         keypoints: keypoints.keypoints.len(),
-        pose_translation_rmse_mm: error.translation_rmse_m * 1e3,
-        pose_rotation_mean_deg: error.rotation_mean_rad.to_degrees(),
+        pose_translation_rmse_mm: walk.error.translation_rmse_m * 1e3,
+        pose_rotation_mean_deg: walk.error.rotation_mean_rad.to_degrees(),
         seed: options.seed,
         warnings,
     })
@@ -241,7 +226,6 @@ pub fn simulate(
 /// Takes the photographs and measures depth, frame by frame. Returns how many frames lay there already.
 fn photograph(
     stage: &Stage,
-    model: &TriangleMesh,
     options: &SimulateOptions,
     orbit: &Orbit,
     out: &Path,
@@ -252,8 +236,16 @@ fn photograph(
     let shoot = |i: usize, size, quality| {
         let t = orbit.time_s(i);
         let at_full = orbit.intrinsics(t);
-        let shot =
-            Shot { stage, model, size, intrinsics: at_full.resized(options.size, size), quality, salt: frame_salt(i) };
+        let shot = Shot {
+            stage,
+            size,
+            intrinsics: at_full.resized(options.size, size),
+            distortion: Distortion(options.lens.distortion),
+            readout_s: options.lens.readout_s,
+            quality,
+            focus_m: orbit.distance_m(t) as f32,
+            salt: frame_salt(i),
+        };
         expose(&shot, |offset_s| orbit.object_from_cam(t + offset_s))
     };
     let mut exposures: Option<Vec<Development>> = None;
@@ -303,6 +295,7 @@ fn annotate(
                 frame: FrameId(i as u32),
                 intrinsics: orbit.intrinsics(t),
                 size: options.size,
+                distortion: Distortion(options.lens.distortion),
                 object_from_cam: orbit.object_from_cam(t),
             }
         })

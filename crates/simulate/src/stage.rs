@@ -1,14 +1,16 @@
 //! The set: the model on a table, with what lies round it. Everything is in the object frame, in metres.
 
 use glam::Vec3;
-use mb_geometry::Aabb;
+use mb_geometry::{Aabb, Ray};
 use mb_job::{Error, Result, rng};
 use mb_mesh::{Bvh, TriangleMesh};
 use mb_render::Scene;
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 use rand::RngExt;
 
+use crate::board::Print;
 use crate::light::Light;
+use crate::plastic::{Edge, Plastic};
 use crate::texture::{self, Finish, linear_from_srgb};
 use crate::{SimulateOptions, Table, streams};
 
@@ -37,6 +39,34 @@ struct Patch {
 pub(crate) struct Surface {
     pub normal: Vec3,
     pub finish: Finish,
+    /// How much of it is a dark gap between two parts, 0 to 1.
+    pub gap: f32,
+}
+
+/// What a ray meets.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Glimpse {
+    pub radiance: Vec3,
+    /// Whether it leaves the set.
+    pub free: bool,
+}
+
+/// Half of the gap between the walls of two bricks: each stands back by 0.1 mm from the nominal pitch.
+const GAP_M: f32 = 0.0001;
+/// Surfaces of two parts at the same height within this are flush.
+const FLUSH_M: f32 = 0.0003;
+/// ABS comes out of a polished mould.
+const PLASTIC_ROUGHNESS: f32 = 0.17;
+/// Rays start this far off the surface.
+pub(crate) const LIFT_M: f32 = 3e-5;
+/// Rays end here: further surfaces count as part of the room.
+pub(crate) const REACH_M: f64 = 0.8;
+
+pub(crate) fn ray(from: Vec3, towards: Vec3) -> Ray {
+    Ray {
+        origin: Point3::new(f64::from(from.x), f64::from(from.y), f64::from(from.z)),
+        direction: Vector3::new(f64::from(towards.x), f64::from(towards.y), f64::from(towards.z)),
+    }
 }
 
 /// The set with its acceleration structures.
@@ -44,12 +74,11 @@ pub(crate) struct Stage {
     pub scene: Scene,
     pub bvh: Bvh,
     pub light: Light,
-    pub mesh: TriangleMesh,
     /// The first triangles are the model's.
     pub model_triangles: usize,
     pub table_kind: Table,
-    /// `[model_triangles]` normals at the three corners.
-    corner_normals: Vec<[Vec3; 3]>,
+    plastic: Plastic,
+    pub board: Option<Print>,
     /// `[model_triangles]` linear albedo.
     albedos: Vec<Vec3>,
     /// `[triangles - model_triangles]` index into `patches`.
@@ -58,9 +87,6 @@ pub(crate) struct Stage {
     table_half_m: (f32, f32),
     salt: u32,
 }
-
-/// Facets that meet at less than this angle are one curved surface: a stud has 16 facets of 22.5 degrees.
-const CREASE_COS: f32 = 0.85;
 
 pub(crate) fn vec3(p: &Point3<f64>) -> Vec3 {
     Vec3::new(p.x as f32, p.y as f32, p.z as f32)
@@ -105,14 +131,20 @@ impl Builder {
     }
 }
 
-fn build_set(model: &TriangleMesh, bounds: &Aabb, kind: Table, seed: u64, half_m: (f32, f32)) -> Builder {
+fn build_set(
+    model: &TriangleMesh,
+    bounds: &Aabb,
+    kind: Table,
+    seed: u64,
+    half_m: (f32, f32),
+    footprint: f32,
+) -> Builder {
     let mut rng = rng(seed, streams::STAGE);
     let mut mesh = TriangleMesh::new(model.vertices.clone(), model.triangles.clone());
     mesh.vertices.reserve(256);
     let mut builder = Builder { mesh, patch_of: Vec::new(), patches: Vec::new() };
     let center = vec3(&bounds.center());
     let floor = Vec3::new(center.x, bounds.min.y as f32, center.z);
-    let footprint = 0.5 * (bounds.extent().x.hypot(bounds.extent().z)) as f32;
 
     // The table: turned against the model and not centred under it.
     let turn: f32 = rng.random_range(0.0..std::f32::consts::TAU);
@@ -156,41 +188,6 @@ fn build_set(model: &TriangleMesh, bounds: &Aabb, kind: Table, seed: u64, half_m
     builder
 }
 
-/// Normals at the corners of each triangle: the area-weighted mean over the facets of the same part that meet there
-/// at less than the crease angle.
-fn corner_normals(mesh: &TriangleMesh) -> Vec<[Vec3; 3]> {
-    let part = |t: usize| mesh.triangle_parts.as_ref().map_or(0, |parts| parts[t]);
-    let scaled: Vec<Vec3> = (0..mesh.triangles.len())
-        .map(|t| {
-            let n = mesh.scaled_normal(t);
-            Vec3::new((n.x * 1e6) as f32, (n.y * 1e6) as f32, (n.z * 1e6) as f32)
-        })
-        .collect();
-    // Corners at the same place (to 10 micrometres) of the same part stand beside each other once sorted.
-    let mut corners: Vec<([i64; 3], u32, u32, u8)> = Vec::with_capacity(3 * scaled.len());
-    for (t, triangle) in mesh.triangles.iter().enumerate() {
-        for (k, v) in triangle.iter().enumerate() {
-            let p = mesh.vertices[*v as usize];
-            let place = [p.x, p.y, p.z].map(|c| (c * 1e5).round() as i64);
-            corners.push((place, part(t), t as u32, k as u8));
-        }
-    }
-    corners.sort_unstable();
-    let mut normals = vec![[Vec3::ZERO; 3]; scaled.len()];
-    for group in corners.chunk_by(|a, b| a.0 == b.0 && a.1 == b.1) {
-        for &(_, _, t, k) in group {
-            let own = scaled[t as usize].normalize_or_zero();
-            let smooth: Vec3 = group
-                .iter()
-                .map(|&(_, _, other, _)| scaled[other as usize])
-                .filter(|n| n.normalize_or_zero().dot(own) > CREASE_COS)
-                .sum();
-            normals[t as usize][k as usize] = smooth.try_normalize().unwrap_or(own);
-        }
-    }
-    normals
-}
-
 impl Stage {
     /// Sets the scene round `model` (object frame, metres).
     ///
@@ -213,8 +210,16 @@ impl Stage {
             .unwrap_or_else(|| Table::ALL[rng(options.seed, streams::TABLE).random_range(0..Table::ALL.len())]);
         let footprint = 0.5 * extent.x.hypot(extent.z) as f32;
         let least: (f32, f32) = if table_kind == Table::Bamboo { (0.36, 0.26) } else { (0.6, 0.42) };
+        let board = options.board_spec()?;
+        let footprint = board.as_ref().map_or(footprint, |spec| footprint.max(Print::reach_m(spec)));
         let half_m = (least.0.max(footprint + 0.15), least.1.max(footprint + 0.10));
-        let built = build_set(model, &bounds, table_kind, options.seed, half_m);
+        let built = build_set(model, &bounds, table_kind, options.seed, half_m, footprint);
+        let board = board.map(|spec| {
+            let middle = Point3::new(bounds.center().x, bounds.min.y, bounds.center().z);
+            let turn_rad = rng(options.seed, streams::BOARD).random_range(0.0..std::f64::consts::TAU);
+            Print::new(&spec, &middle, turn_rad)
+        });
+        let salt = (options.seed as u32).wrapping_mul(0x9E37_79B1) ^ 0x5EED;
         let grey = [160u8; 3];
         let albedos = (0..model.triangles.len())
             .map(|t| linear_from_srgb(model.triangle_colors.as_ref().map_or(grey, |colors| colors[t])))
@@ -225,91 +230,99 @@ impl Stage {
             scene: Scene::new(&built.mesh),
             bvh: Bvh::new(&built.mesh),
             light: Light::new(options.seed),
-            corner_normals: corner_normals(model),
+            plastic: Plastic::new(model, salt),
+            board,
             model_triangles: model.triangles.len(),
-            mesh: built.mesh,
             table_kind,
             albedos,
             patch_of: built.patch_of,
             patches: built.patches,
             table_half_m: half_m,
-            salt: (options.seed as u32).wrapping_mul(0x9E37_79B1) ^ 0x5EED,
+            salt,
         })
-    }
-
-    /// The part that a triangle belongs to; the set's patches count as parts of their own.
-    pub fn part(&self, model: &TriangleMesh, triangle: u32) -> u32 {
-        let t = triangle as usize;
-        if t < self.model_triangles {
-            model.triangle_parts.as_ref().map_or(0, |parts| parts[t])
-        } else {
-            u32::MAX - u32::from(self.patch_of[t - self.model_triangles])
-        }
-    }
-
-    /// Normal of the model's surface, smooth over curved parts, towards `view`; `None` off the model.
-    fn model_normal(&self, t: usize, p: Vec3) -> Vec3 {
-        let [a, b, c] = self.mesh.triangles[t].map(|v| vec3(&self.mesh.vertices[v as usize]));
-        let (e1, e2, d) = (b - a, c - a, p - a);
-        let (d11, d12, d22) = (e1.dot(e1), e1.dot(e2), e2.dot(e2));
-        let (d1, d2) = (d.dot(e1), d.dot(e2));
-        let determinant = d11 * d22 - d12 * d12;
-        let [n0, n1, n2] = self.corner_normals[t];
-        if determinant <= 0.0 {
-            return n0;
-        }
-        let v = ((d22 * d1 - d12 * d2) / determinant).clamp(0.0, 1.0);
-        let w = ((d11 * d2 - d12 * d1) / determinant).clamp(0.0, 1.0 - v);
-        (n0 * (1.0 - v - w) + n1 * v + n2 * w).try_normalize().unwrap_or(n0)
     }
 
     /// The normal at `p` on `triangle`, without relief, turned towards `view` (unit, from the surface).
     pub fn normal(&self, triangle: u32, p: Vec3, view: Vec3) -> Vec3 {
         let t = triangle as usize;
-        let normal = if t < self.model_triangles {
-            self.model_normal(t, p)
-        } else {
-            self.patches[usize::from(self.patch_of[t - self.model_triangles])].normal
-        };
+        if t < self.model_triangles {
+            return self.plastic.normal(t, p, view);
+        }
+        let normal = self.patches[usize::from(self.patch_of[t - self.model_triangles])].normal;
         if normal.dot(view) < 0.0 { -normal } else { normal }
     }
 
-    /// Colour and finish at `p` on `triangle`.
-    fn finish(&self, triangle: u32, p: Vec3, pixel_m: f32) -> (Finish, Option<&Patch>) {
+    /// The surface at `p` on `triangle`, with relief and rounded edges, its normal towards `view` (unit, from the
+    /// surface). Detail below `pixel_m` (the size of a pixel that faces it) is left out.
+    pub fn surface(&self, triangle: u32, p: Vec3, view: Vec3, pixel_m: f32) -> Surface {
         let t = triangle as usize;
         if t < self.model_triangles {
-            return (Finish { albedo: self.albedos[t], roughness: 0.2, slope: (0.0, 0.0) }, None);
+            let moulded = self.plastic.moulded(t, p, view, pixel_m);
+            let gap = moulded.edge.map_or(0.0, |edge| self.gap(t, p, view, edge, pixel_m));
+            let finish = Finish { albedo: self.albedos[t], roughness: PLASTIC_ROUGHNESS, coat: 1.0, slope: (0.0, 0.0) };
+            return Surface { normal: moulded.normal, finish, gap };
         }
         let index = self.patch_of[t - self.model_triangles];
         let patch = &self.patches[usize::from(index)];
+        let flat = if patch.normal.dot(view) < 0.0 { -patch.normal } else { patch.normal };
+        // What a pixel covers across and along its slant.
+        let slanted_m = pixel_m / flat.dot(view).max(0.1).sqrt();
         let d = p - patch.origin;
         let at = (d.dot(patch.x_axis), d.dot(patch.y_axis));
         let salt = self.salt ^ u32::from(index).wrapping_mul(0x85EB_CA6B);
         let finish = match patch.material {
-            Material::Table => texture::table(self.table_kind, at, pixel_m, self.table_half_m, salt),
-            Material::Surroundings => texture::surroundings(at, pixel_m, salt),
+            Material::Table => self
+                .board
+                .as_ref()
+                .and_then(|board| board.finish(p, slanted_m))
+                .unwrap_or_else(|| texture::table(self.table_kind, at, slanted_m, self.table_half_m, salt)),
+            Material::Surroundings => texture::surroundings(at, slanted_m, salt),
             Material::Edge => texture::edge(at, salt),
             Material::Plaster => texture::plaster(at, salt),
-            Material::Clutter(base) => texture::clutter(base, at, salt),
+            Material::Clutter(base) => texture::clutter(base, at, slanted_m, salt),
         };
-        (finish, Some(patch))
+        let (sx, sy) = finish.slope;
+        Surface { normal: (flat - patch.x_axis * sx - patch.y_axis * sy).normalize(), finish, gap: 0.0 }
     }
 
-    /// The surface at `p` on `triangle`, with relief, its normal towards `view` (unit, from the surface). Detail below
-    /// `pixel_m` (the size of a pixel that faces it) is left out.
-    pub fn surface(&self, triangle: u32, p: Vec3, view: Vec3, pixel_m: f32) -> Surface {
-        let mut normal = self.normal(triangle, p, view);
-        let slanted_m = pixel_m / normal.dot(view).max(0.1);
-        let (finish, patch) = self.finish(triangle, p, slanted_m);
-        if let Some(patch) = patch {
-            let (sx, sy) = finish.slope;
-            normal = (normal - patch.x_axis * sx - patch.y_axis * sy).normalize();
+    /// How much of a pixel at `p`, beside an edge of its part, is the gap to another part whose surface goes on flush,
+    /// 0 to 1.
+    fn gap(&self, triangle: usize, p: Vec3, view: Vec3, edge: Edge, pixel_m: f32) -> f32 {
+        // A pixel wider than the gap mixes it with what lies beside it.
+        let half = GAP_M.max(0.5 * pixel_m);
+        if edge.distance_m >= 1.5 * half {
+            return 0.0;
         }
-        Surface { normal, finish }
+        let normal = self.plastic.normal(triangle, p, view);
+        let over = p + edge.across * (edge.distance_m + FLUSH_M) + normal * FLUSH_M;
+        let flush = self.bvh.cast(&ray(over, -normal), f64::from(2.0 * FLUSH_M)).is_some_and(|hit| {
+            let other = hit.triangle as usize;
+            other >= self.model_triangles || self.plastic.part(other) != self.plastic.part(triangle)
+        });
+        let covered = (1.5 - edge.distance_m / half).min(1.0);
+        if flush { covered * (GAP_M / half) } else { 0.0 }
     }
 
-    /// Whether a triangle is the model's.
-    pub fn is_model(&self, triangle: u32) -> bool {
-        (triangle as usize) < self.model_triangles
+    /// Radiance that arrives at `from` along the ray from `towards` (unit), the window itself left out: of surfaces one
+    /// bounce of its light and a typical share of the room's. `blur` is the angle that the ray stands for.
+    pub fn glimpse(&self, from: Vec3, towards: Vec3, shadowed: bool, blur: f32) -> Glimpse {
+        let light = &self.light;
+        let Some(hit) = self.bvh.cast(&ray(from, towards), REACH_M) else {
+            return Glimpse { radiance: light.room(towards, blur), free: true };
+        };
+        let t = hit.t as f32;
+        let p = from + towards * t;
+        let surface = self.surface(hit.triangle, p, -towards, (blur * t).max(0.0004));
+        let facing = surface.normal.dot(light.window).max(0.0);
+        let lit = if facing <= 0.0 {
+            0.0
+        } else if shadowed {
+            let start = p + surface.normal * LIFT_M;
+            if self.bvh.occluded(&ray(start, light.window), REACH_M) { 0.0 } else { facing }
+        } else {
+            0.6 * facing
+        };
+        let arriving = light.window_strength * lit + light.room(surface.normal, 0.6) * 0.5;
+        Glimpse { radiance: surface.finish.albedo * arriving, free: false }
     }
 }

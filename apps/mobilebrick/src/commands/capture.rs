@@ -8,7 +8,7 @@ use mb_download::DownloadOptions;
 use mb_geometry::ImageSize;
 use mb_job::Result;
 use mb_pipeline::{ModelCapture, simulate_model};
-use mb_simulate::{Quality, SimulateOptions};
+use mb_simulate::{DriftOptions, LensOptions, Quality, SimulateOptions, Table};
 
 use super::model::ModelArgument;
 use super::{Seed, SequenceArgument};
@@ -80,12 +80,78 @@ pub struct Simulate {
     #[arg(long, value_name = "MM")]
     radius: Option<f64>,
 
+    /// Camera angles above the table, degrees: one circle round the model for each
+    #[arg(long, value_name = "DEG,...", value_delimiter = ',', default_values_t = SimulateOptions::default().elevations_deg)]
+    elevations: Vec<f64>,
+
+    /// How much the hand wavers: 1 is a person's, 0 a rail
+    #[arg(long, value_name = "SHARE", default_value_t = SimulateOptions::default().hand_jitter)]
+    jitter: f64,
+
+    /// Photographs per second of a walk at 0.2 m/s (published sequences: 10); absent, they spread over all circles
+    #[arg(long, value_name = "HZ")]
+    fps: Option<f64>,
+
+    /// Calibration board printed under the model, such as charuco:7x5:0.030:0.022:DICT_5X5_100
+    #[arg(long, value_name = "SPEC")]
+    board: Option<String>,
+
+    /// What the model stands on; the seed chooses where absent
+    #[arg(long, value_enum)]
+    table: Option<TableArgument>,
+
+    /// Radial distortion k1,k2 that the intrinsic files do not tell
+    #[arg(long, value_name = "K1,K2", value_parser = parse_distortion, allow_hyphen_values = true)]
+    distortion: Option<[f64; 2]>,
+
+    /// Rolling shutter: time to read the sensor, milliseconds
+    #[arg(long, value_name = "MS", default_value_t = 0.0)]
+    readout: f64,
+
+    /// Expected error of the reported poses: relative translations, millimetres
+    #[arg(long, value_name = "MM", default_value_t = DriftOptions::default().translation_rmse_mm)]
+    drift_translation: f64,
+
+    /// Expected error of the reported poses: relative rotations, degrees
+    #[arg(long, value_name = "DEG", default_value_t = DriftOptions::default().rotation_mean_deg)]
+    drift_rotation: f64,
+
     /// Play of outer side walls, millimetres; real bricks have about 0.1
     #[arg(long, value_name = "MM", default_value_t = 0.0)]
     clearance: f64,
 
     #[command(flatten)]
     seed: Seed,
+}
+
+/// What the model stands on.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum TableArgument {
+    /// Two bamboo boards on a sofa
+    Bamboo,
+    /// Oiled oak planks
+    Oak,
+    /// A checked tablecloth
+    Gingham,
+    /// A printed linen cloth
+    Linen,
+    /// Polished marble
+    Marble,
+    /// A newspaper
+    Newspaper,
+}
+
+impl From<TableArgument> for Table {
+    fn from(table: TableArgument) -> Self {
+        match table {
+            TableArgument::Bamboo => Self::Bamboo,
+            TableArgument::Oak => Self::Oak,
+            TableArgument::Gingham => Self::Gingham,
+            TableArgument::Linen => Self::Linen,
+            TableArgument::Marble => Self::Marble,
+            TableArgument::Newspaper => Self::Newspaper,
+        }
+    }
 }
 
 impl Simulate {
@@ -102,6 +168,17 @@ impl Simulate {
                 },
                 seed: self.seed.seed,
                 radius_m: self.radius.map(|mm| mm * 1e-3),
+                elevations_deg: self.elevations.clone(),
+                hand_jitter: self.jitter,
+                frames_per_s: self.fps,
+                board: self.board.clone(),
+                table: self.table.map(Into::into),
+                lens: LensOptions { distortion: self.distortion.unwrap_or_default(), readout_s: self.readout * 1e-3 },
+                drift: DriftOptions {
+                    translation_rmse_mm: self.drift_translation,
+                    rotation_mean_deg: self.drift_rotation,
+                    ..DriftOptions::default()
+                },
                 ..SimulateOptions::default()
             },
         };
@@ -123,6 +200,11 @@ fn parse_size(text: &str) -> Result<ImageSize, String> {
     let sides = text.split_once(['x', 'X']).and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let (width, height) = sides.ok_or("must look like 1920x1440")?;
     Ok(ImageSize::new(width, height))
+}
+
+fn parse_distortion(text: &str) -> Result<[f64; 2], String> {
+    let pair = text.split_once(',').and_then(|(a, b)| Some([a.trim().parse().ok()?, b.trim().parse().ok()?]));
+    pair.ok_or_else(|| "must look like 0.01,-0.002".to_owned())
 }
 
 /// Formats that can be read.
