@@ -51,8 +51,14 @@ impl ExactScene {
                 .into());
         }
         let mesh = mesh.transformed(&alignment.world_from_object);
-        let scene = Scene::new(&mesh);
-        Ok(Self { mesh, frames: sequence.aligned_frames(alignment), size: sequence.image_size(), scene })
+        Ok(Self::new(mesh, sequence.aligned_frames(alignment), sequence.image_size()))
+    }
+
+    /// A scene that is on no disk: the model in the world frame, metres, and cameras whose intrinsics are those of
+    /// photographs of `size`.
+    pub fn new(mesh_in_world: TriangleMesh, frames: Vec<Frame>, size: ImageSize) -> Self {
+        let scene = Scene::new(&mesh_in_world);
+        Self { mesh: mesh_in_world, frames, size, scene }
     }
 
     /// The camera of a frame, at the photographs' size.

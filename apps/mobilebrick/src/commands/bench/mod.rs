@@ -1,6 +1,7 @@
 //! `bench`: methods beside each other, one file a subcommand.
 
 mod leaderboard;
+mod perturbed_poses;
 mod poses;
 mod table;
 
@@ -21,6 +22,8 @@ pub enum Bench {
     Leaderboard(leaderboard::Leaderboard),
     /// The paper's study of camera poses: the phone's and the aligned ones against those of a board in view
     Poses(poses::Poses),
+    /// The paper's study of perturbed poses: exact depth fused with true and with perturbed cameras
+    PerturbedPoses(perturbed_poses::PerturbedPoses),
 }
 
 impl Bench {
@@ -30,6 +33,7 @@ impl Bench {
             Self::Table(c) => c.run(),
             Self::Leaderboard(c) => c.run(terminal),
             Self::Poses(c) => c.run(terminal),
+            Self::PerturbedPoses(c) => c.run(terminal),
         }
     }
 }
