@@ -280,6 +280,18 @@ impl ContourFit<'_> {
         object_step.iter().all(|v| v.is_finite())
     }
 
+    /// Like [`Self::step`], with the object held.
+    pub fn step_drifts(&mut self, observed: &Observed, limit_px: f64) -> bool {
+        let noise = self.noise_px(observed, limit_px);
+        let equations = self.equations(observed, limit_px, &noise);
+        let center = self.center();
+        for (frame, e) in self.frames.iter_mut().zip(&equations.frames) {
+            let Some(cholesky) = e.own.cholesky() else { return false };
+            frame.drift = moved(&frame.drift, &cholesky.solve(&e.right), &center);
+        }
+        true
+    }
+
     /// Standard deviation of the residuals within the limit, from their median, for each kind of edge (outlines before
     /// the table are sharp, edges of one colour inside the model are not) and for each frame.
     fn noise_px(&self, observed: &Observed, limit_px: f64) -> Noise {

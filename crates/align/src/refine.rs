@@ -387,7 +387,7 @@ fn coarsest_pass(fit: &mut ContourFit, coarsest: usize) {
         fit.frames.iter_mut().for_each(|f| f.drift = Rigid3::identity());
         fit.log_scale = 0.0;
         for (level, range_px, repetitions) in PASSES.into_iter().filter(|pass| pass.0 == coarsest) {
-            pass(fit, level, range_px.max(10), repetitions);
+            pass(fit, (level, range_px.max(10), repetitions), ContourFit::step);
         }
         let confidence = Agreement::of_all(&fit.agreement(coarsest.saturating_sub(1), AGREES_PX)).confidence();
         if confidence > best.0 {
@@ -401,7 +401,11 @@ fn coarsest_pass(fit: &mut ContourFit, coarsest: usize) {
     fit.frames.iter_mut().zip(best.3).for_each(|(f, drift)| f.drift = drift);
 }
 
-fn pass(fit: &mut ContourFit, level: usize, range_px: usize, repetitions: usize) {
+/// How a fit goes towards the observed edges within a limit in pixels.
+type Step<'a> = fn(&mut ContourFit<'a>, &Observed, f64) -> bool;
+
+/// One of [`PASSES`].
+fn pass<'a>(fit: &mut ContourFit<'a>, (level, range_px, repetitions): (usize, usize, usize), step: Step<'a>) {
     let mut observed = fit.observe(level, range_px);
     for repetition in 0..repetitions {
         if repetition > 0 && repetition % 2 == 0 {
@@ -413,20 +417,56 @@ fn pass(fit: &mut ContourFit, level: usize, range_px: usize, repetitions: usize)
         let share = 1.0 - repetition as f64 / repetitions as f64;
         let limit_px = (range_px as f64 * share).max(AGREES_PX);
         for _ in 0..4 {
-            fit.step(&observed, limit_px);
+            step(fit, &observed, limit_px);
         }
     }
 }
 
 fn coarse_to_fine(fit: &mut ContourFit, coarsest: usize, steps: &Steps) -> Result<()> {
     coarsest_pass(fit, coarsest);
-    for (level, range_px, repetitions) in PASSES {
-        if level < coarsest {
-            pass(fit, level, range_px, repetitions);
+    for finer in PASSES {
+        if finer.0 < coarsest {
+            pass(fit, finer, ContourFit::step);
+        }
+        if finer.0 == 0 && mend_strays(fit, coarsest) {
+            pass(fit, finer, ContourFit::step);
         }
         steps.step()?;
     }
     Ok(())
+}
+
+/// Fits frames anew that may have taken wrong edges for the model's: rows of bricks look alike. Drift changes slowly, so
+/// a frame whose drift is more than the prior's deviation from a neighbour's is fitted again from there, and what shows
+/// more of the model's edges stays. Returns whether any frame changed.
+fn mend_strays(fit: &mut ContourFit, coarsest: usize) -> bool {
+    let count = fit.frames.len();
+    // Forwards and backwards: a row of strays is mended from its good neighbour on.
+    let pairs = (1..count).map(|i| (i, i - 1)).chain((1..count).rev().map(|i| (i - 1, i)));
+    let mut mended = false;
+    for (i, neighbour) in pairs {
+        let step = fit.drift_twist(&fit.frames[i]) - fit.drift_twist(&fit.frames[neighbour]);
+        if step.dot(&(fit.prior_information() * step)) <= 1.0 {
+            continue;
+        }
+        let start = fit.frames[neighbour].drift;
+        let mut alone = ContourFit { frames: vec![fit.frames.remove(i)], ..*fit };
+        let confidence =
+            |alone: &ContourFit| Agreement::of_all(&alone.agreement(coarsest.min(1), AGREES_PX)).confidence();
+        let (before, kept) = (confidence(&alone), alone.frames[0].drift);
+        alone.frames[0].drift = start;
+        for finer in PASSES.into_iter().filter(|pass| pass.0 < coarsest.max(1)) {
+            pass(&mut alone, finer, ContourFit::step_drifts);
+        }
+        if confidence(&alone) > before {
+            mended = true;
+        } else {
+            alone.frames[0].drift = kept;
+        }
+        fit.frames.extend(alone.frames);
+        fit.frames[i..].rotate_right(1);
+    }
+    mended
 }
 
 /// Frames with a photograph, spread evenly, posed as the phone has them.
@@ -467,5 +507,93 @@ fn dot(picture: &mut RgbImage, pixel: &Point2<f64>, color: [u8; 3]) {
     let (x, y) = (pixel.x.round(), pixel.y.round());
     if x >= 0.0 && y >= 0.0 && x < size.width as f64 && y < size.height as f64 {
         picture[(x as usize, y as usize)] = color;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use mb_geometry::{ImageSize, Intrinsics};
+    use mb_image::Image;
+    use mb_mesh::TriangleMesh;
+    use mb_render::{NO_TRIANGLE, Scene};
+    use nalgebra::{Point3, UnitQuaternion, Vector3};
+
+    const ROW_M: f64 = 0.0096;
+
+    /// A wall of rows of bricks in two colours by turns, 10 cm wide and 3 cm deep: two rows higher it looks much the same.
+    fn wall(rows: usize) -> TriangleMesh {
+        let mut mesh = TriangleMesh::default();
+        let (mut colors, mut parts) = (Vec::new(), Vec::new());
+        for row in 0..rows {
+            let first = mesh.vertices.len() as u32;
+            for i in 0..8 {
+                let side = |axis: usize| f64::from(i >> axis & 1);
+                mesh.vertices.push(Point3::new(
+                    0.1 * side(0) - 0.05,
+                    ROW_M * (row as f64 + side(1)),
+                    0.03 * side(2) - 0.015,
+                ));
+            }
+            for [a, b, c, d] in [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]] {
+                for triangle in [[a, b, c], [a, c, d]] {
+                    mesh.triangles.push(triangle.map(|v: u32| v + first));
+                    colors.push(if row % 2 == 0 { [190, 30, 30] } else { [220, 190, 40] });
+                    parts.push(row as u32);
+                }
+            }
+        }
+        TriangleMesh { triangle_colors: Some(colors), triangle_parts: Some(parts), ..mesh }
+    }
+
+    #[test]
+    fn a_frame_that_took_the_wrong_rows_of_bricks_is_brought_back_from_its_neighbours() {
+        let mesh = wall(10);
+        let colors = mesh.triangle_colors.as_ref().expect("the wall is coloured");
+        let scene = Scene::new(&mesh);
+        let (size, k) = (ImageSize::new(480, 360), Intrinsics { fx: 400.0, fy: 400.0, cx: 239.5, cy: 179.5 });
+        let mut edges = ModelEdges::new(&mesh, 0);
+        let frames: Vec<ContourFrame> = (0..4)
+            .map(|i| {
+                let angle = 0.5 * f64::from(i) + 0.3;
+                let place = Vector3::new(0.3 * angle.cos(), 0.2, 0.3 * angle.sin());
+                let towards = Vector3::new(0.0, 0.05, 0.0) - place;
+                let rotation = UnitQuaternion::face_towards(&towards, &-Vector3::y());
+                let cam_from_world = Rigid3::<World, _>::from_parts(rotation, place).inverse();
+                let cam_from_object = cam_from_world * Rigid3::<World, Object>::identity();
+                let raster = scene.render(&view_at(&k, size, &cam_from_object, 0));
+                let image = Image::from_fn(size, |x, y| match raster.triangle[(x, y)] {
+                    NO_TRIANGLE => [120, 130, 140],
+                    t => colors[t as usize],
+                });
+                let pyramid = Pyramid::new(image, 2);
+                ContourFrame { intrinsics: k, size, cam_from_world, drift: Rigid3::identity(), pyramid }
+            })
+            .collect();
+        let views: Vec<_> = frames
+            .iter()
+            .map(|f| view_at(&k, size, &(f.cam_from_world * Rigid3::<World, Object>::identity()), 1))
+            .collect();
+        edges.keep_visible(&views);
+        let mut fit = ContourFit {
+            edges: &edges,
+            frames,
+            world_from_object: Rigid3::identity(),
+            log_scale: 0.0,
+            scale_information: f64::INFINITY,
+            prior: DriftPrior { rotation_rad: 0.01, translation_m: 0.0045 },
+            samples: 800,
+        };
+        assert!(!mend_strays(&mut fit, 2), "nothing has strayed");
+        for strays in [vec![2], vec![0, 1]] {
+            for &i in &strays {
+                fit.frames[i].drift = Rigid3::from_translation(Vector3::new(0.0, 2.0 * ROW_M, 0.0));
+            }
+            assert!(mend_strays(&mut fit, 2));
+            for frame in &fit.frames {
+                let shift_mm = fit.drift_twist(frame).fixed_rows::<3>(3).norm() * 1e3;
+                assert!(shift_mm < 0.5, "{strays:?}: {shift_mm} mm");
+            }
+        }
     }
 }

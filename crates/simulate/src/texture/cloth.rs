@@ -36,7 +36,7 @@ pub(super) fn gingham((x, y): (f32, f32), pixel_m: f32, salt: u32) -> Finish {
     let color = mix(Vec3::new(0.80, 0.78, 0.74), Vec3::new(0.11, 0.15, 0.36), 0.5 * (check(wx) + check(wy)));
     let (brightness, slope) = weave(x, y, 0.0011, pixel_m, salt);
     let worn = 0.85 + 0.3 * fractal(x * 30.0, y * 30.0, 4, 0.6, salt);
-    Finish { albedo: (color * brightness * worn).min(Vec3::splat(0.9)), roughness: 0.95, coat: 0.15, slope }
+    Finish { albedo: color * brightness * worn, roughness: 0.95, coat: 0.15, slope }
 }
 
 /// A coarse linen cloth with a printed pattern of leaves.

@@ -51,14 +51,16 @@ fn kept(lattice_m: f32, pixel_m: f32) -> f32 {
 
 /// The surface that the model stands on, at `(x, y)` metres from the middle of the table.
 pub(crate) fn table(kind: Table, at: (f32, f32), pixel_m: f32, half_extent_m: (f32, f32), salt: u32) -> Finish {
-    match kind {
+    let finish = match kind {
         Table::Bamboo => wood::bamboo(at, pixel_m, half_extent_m, salt),
         Table::Oak => wood::oak(at, pixel_m, salt),
         Table::Gingham => cloth::gingham(at, pixel_m, salt),
         Table::Linen => cloth::linen(at, pixel_m, salt),
         Table::Marble => stone::marble(at, pixel_m, salt),
         Table::Newspaper => print::newspaper(at, pixel_m, salt),
-    }
+    };
+    // Where light and dark patterns meet, their product may leave what a surface can have.
+    Finish { albedo: finish.albedo.clamp(Vec3::splat(0.01), Vec3::splat(0.9)), ..finish }
 }
 
 /// What lies below and beyond the table: the coarse cover of a sofa, or a carpet.

@@ -26,5 +26,5 @@ pub(super) fn marble((x, y): (f32, f32), pixel_m: f32, salt: u32) -> Finish {
             color *= 1.0 + seen * strength * (noise(x / lattice_m, y / lattice_m, salt ^ 8) - 0.5);
         }
     }
-    Finish { albedo: color.min(Vec3::splat(0.85)), roughness: 0.22, coat: 1.0, slope: (0.0, 0.0) }
+    Finish { albedo: color, roughness: 0.22, coat: 1.0, slope: (0.0, 0.0) }
 }
