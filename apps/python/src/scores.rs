@@ -53,8 +53,7 @@ pub fn evaluate_surface<'py>(
     thresholds_mm: Vec<f64>,
 ) -> PyResult<Bound<'py, PyAny>> {
     let protocol: SurfaceProtocol = protocol.parse().map_err(PyValueError::new_err)?;
-    let mut options =
-        SurfaceOptions { protocol, seed, more_thresholds_mm: thresholds_mm, ..SurfaceOptions::default() };
+    let mut options = SurfaceOptions { protocol, seed, more_thresholds_mm: thresholds_mm, ..SurfaceOptions::default() };
     options.points = points.unwrap_or(options.points);
     let scores = run(py, |progress| match &pred {
         Surface::File(path) => eval_surface(&gt, path, &options, progress),
