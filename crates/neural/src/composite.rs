@@ -71,6 +71,69 @@ pub fn composite_backward(
     }
 }
 
+/// Rays of a tile, composited one after the other, and what a loss asks of their samples.
+#[derive(Debug, Default)]
+pub struct RayComposites {
+    /// Opacity and colour of each sample.
+    pub alphas: Vec<f32>,
+    colors: Vec<[f32; 3]>,
+    weights: Vec<f32>,
+    backgrounds: Vec<[f32; 3]>,
+    /// The samples of each ray end here.
+    ends: Vec<usize>,
+    /// The rays.
+    pub rays: Vec<Composite>,
+    /// The loss by the opacity and colour of each sample, once it was sent back.
+    pub d_alphas: Vec<f32>,
+    /// See `d_alphas`.
+    pub d_colors: Vec<[f32; 3]>,
+}
+
+impl RayComposites {
+    /// Forgets all rays.
+    pub fn clear(&mut self) {
+        self.alphas.clear();
+        self.colors.clear();
+        self.weights.clear();
+        self.backgrounds.clear();
+        self.ends.clear();
+        self.rays.clear();
+        self.d_alphas.clear();
+        self.d_colors.clear();
+    }
+
+    /// Adds a sample to the ray that has begun.
+    pub fn push(&mut self, alpha: f32, color: [f32; 3]) {
+        self.alphas.push(alpha);
+        self.colors.push(color);
+    }
+
+    /// Ends the ray, in front of a background.
+    pub fn end_ray(&mut self, background: [f32; 3]) {
+        let (start, end) = (self.ends.last().copied().unwrap_or(0), self.alphas.len());
+        self.weights.resize(end, 0.0);
+        self.d_alphas.resize(end, 0.0);
+        self.d_colors.resize(end, [0.0; 3]);
+        self.ends.push(end);
+        self.backgrounds.push(background);
+        self.rays.push(composite(&self.alphas[start..], &self.colors[start..], background, &mut self.weights[start..]));
+    }
+
+    /// Sends what a loss asks of a ray back to its samples.
+    pub fn send_back(&mut self, ray: usize, gradient: &CompositeGradient) {
+        let run = ray.checked_sub(1).map_or(0, |before| self.ends[before])..self.ends[ray];
+        composite_backward(
+            &self.alphas[run.clone()],
+            &self.colors[run.clone()],
+            self.backgrounds[ray],
+            &self.weights[run.clone()],
+            gradient,
+            &mut self.d_alphas[run.clone()],
+            &mut self.d_colors[run],
+        );
+    }
+}
+
 /// Opacity of a stretch of length `dt` with density `sigma`: `1 - exp(-sigma dt)`.
 pub fn opacity(sigma: f32, dt: f32) -> f32 {
     -(-sigma * dt).exp_m1()

@@ -23,6 +23,7 @@ use crate::contraction::{contract, contract_gradient};
 use crate::dataset::{RayDataset, SceneRay, TargetRay};
 use crate::model::{GROUPS, Level, Model, StepReport, same_lengths};
 use crate::occupancy::OccupancyGrid;
+use crate::ray_samples::RaySamples;
 use crate::voxel_field::{ColorNetworkOptions, VoxelField, VoxelParameters, VoxelRates, VoxelWorker};
 
 /// How a DVGO is trained. "DVGO" names the defaults of the authors' code (`configs/default.py`), which are the paper's.
@@ -179,23 +180,12 @@ impl UnitBox {
     }
 }
 
-/// Samples of a tile.
+/// A tile: its samples, and what they became.
 #[derive(Debug, Default)]
 struct Tile {
-    positions: Vec<[f32; 3]>,
-    depths: Vec<f32>,
-    runs: Vec<(u32, [f32; 3])>,
-    keep: Vec<u32>,
+    samples: RaySamples<3>,
     weights: Vec<f32>,
     composites: Vec<Composite>,
-}
-
-impl Tile {
-    fn clear(&mut self) {
-        self.positions.clear();
-        self.depths.clear();
-        self.runs.clear();
-    }
 }
 
 #[derive(Debug, Default)]
@@ -305,11 +295,10 @@ impl Dvgo {
     }
 
     /// Adds a ray's samples to the tile; `jitter` in 0..1 shifts them by a part of a step.
-    fn march(&self, ray: &SceneRay, jitter: f32, tile: &mut Tile) {
+    fn march(&self, ray: &SceneRay, jitter: f32, samples: &mut RaySamples<3>) {
         let [nx, ny, nz] = self.field.size();
         let cube = if self.with_masks { 2.0 } else { 4.0 };
         let h = self.options.step * cube * self.bounds.edge(nx * ny * nz);
-        let before = tile.positions.len();
         let range = match self.with_masks {
             true => ray.ball(3f32.sqrt()),
             false => Some((0.0, FAR)),
@@ -319,52 +308,41 @@ impl Dvgo {
             while t < far {
                 let p = ray.at(t);
                 let u = self.unit(p);
-                if let Some(v) = self.bounds.inside(u).filter(|_| self.free.is_occupied(u)) {
-                    tile.positions.push(v);
-                    tile.depths.push(t);
-                }
                 let reach = p.iter().fold(1.0f32, |a, c| a.max(c.abs()));
                 // Contraction shrinks radial steps by the square of the distance.
-                t += if self.with_masks { h } else { (h * reach * reach).min(0.5 * reach) };
+                let dt = if self.with_masks { h } else { (h * reach * reach).min(0.5 * reach) };
+                if let Some(v) = self.bounds.inside(u).filter(|_| self.free.is_occupied(u)) {
+                    samples.push(v, t, dt);
+                }
+                t += dt;
             }
         }
-        tile.runs.push(((tile.positions.len() - before) as u32, ray.direction));
+        samples.end_ray(ray.direction);
     }
 
     /// Opacities, then colours of the samples that matter, then composites.
     fn shade(&self, tile: &mut Tile, worker: &mut VoxelWorker, backgrounds: &[[f32; 3]]) {
         let p = &self.parameters;
         let dim = self.stage().dim;
-        self.field.alphas(p, &tile.positions, self.interval(), worker);
-        tile.keep.clear();
-        let mut first = 0;
-        for run in &mut tile.runs {
-            let last = first + run.0 as usize;
-            let (mut light, before) = (1.0, tile.keep.len());
-            for i in first..last {
+        let samples = &mut tile.samples;
+        self.field.alphas(p, &samples.positions, self.interval(), worker);
+        let kept = samples.retain(|run, keep| {
+            let mut light = 1.0;
+            for i in run {
                 let weight = light * worker.alphas[i];
                 if worker.alphas[i] > dim && weight > dim {
-                    tile.keep.push(i as u32);
+                    keep.push(i as u32);
                     light *= 1.0 - worker.alphas[i];
                 }
             }
-            run.0 = (tile.keep.len() - before) as u32;
-            first = last;
+        });
+        if let Some(keep) = kept {
+            VoxelField::compact(keep, worker);
         }
-        VoxelField::compact(&tile.keep, worker);
-        for (to, from) in tile.keep.iter().enumerate() {
-            tile.positions[to] = tile.positions[*from as usize];
-            tile.depths[to] = tile.depths[*from as usize];
-        }
-        tile.positions.truncate(tile.keep.len());
-        tile.depths.truncate(tile.keep.len());
-        self.field.color(p, &tile.positions, &tile.runs, worker);
-        tile.weights.resize(tile.positions.len(), 0.0);
+        self.field.color(p, &samples.positions, &samples.runs, worker);
+        tile.weights.resize(samples.len(), 0.0);
         tile.composites.clear();
-        let mut first = 0;
-        for ((count, _), background) in tile.runs.iter().zip(backgrounds) {
-            let run = first..first + *count as usize;
-            first = run.end;
+        for (run, background) in samples.ranges().zip(backgrounds) {
             let (alphas, rgb) = (&worker.alphas[run.clone()], &worker.rgb[run.clone()]);
             tile.composites.push(composite(alphas, rgb, *background, &mut tile.weights[run]));
         }
@@ -386,30 +364,28 @@ impl Dvgo {
         let mut next = 0;
         while next < group.rays.len() {
             let first = next;
-            group.tile.clear();
+            group.tile.samples.clear();
             group.backgrounds.clear();
-            while next < group.rays.len() && group.tile.positions.len() < TILE_SAMPLES {
+            while next < group.rays.len() && group.tile.samples.len() < TILE_SAMPLES {
                 group.backgrounds.push(std::array::from_fn(|_| rng.random()));
-                self.march(&group.rays[next].ray, rng.random(), &mut group.tile);
+                self.march(&group.rays[next].ray, rng.random(), &mut group.tile.samples);
                 next += 1;
             }
-            group.marched += group.tile.positions.len();
+            group.marched += group.tile.samples.len();
             self.shade(&mut group.tile, &mut group.field, &group.backgrounds);
             self.losses(group, first..next, 1.0 / (rays * GROUPS) as f32);
-            let Group { field: worker, tile, gradients, rays, .. } = &mut *group;
-            self.field.backward(&self.parameters, transposed, &tile.positions, worker);
+            let Group { field: worker, tile: Tile { samples, .. }, gradients, rays, .. } = &mut *group;
+            self.field.backward(&self.parameters, transposed, &samples.positions, worker);
             if move_cameras {
-                self.field.ray_gradients(&self.parameters, &tile.runs, worker);
-                let mut sample = 0;
-                for (i, target) in rays[first..next].iter().enumerate() {
-                    let mut gradient = RayGradient { origin: [0.0; 3], direction: worker.d_directions[i] };
-                    for _ in 0..tile.runs[i].0 {
-                        let t = tile.depths[sample];
+                self.field.ray_gradients(&self.parameters, &samples.runs, worker);
+                for ((target, run), d) in rays[first..next].iter().zip(samples.ranges()).zip(&worker.d_directions) {
+                    let mut gradient = RayGradient { origin: [0.0; 3], direction: *d };
+                    for i in run {
+                        let t = samples.depths[i];
                         let g: [f32; 3] = std::array::from_fn(|d| {
-                            worker.d_positions[sample][d] / (self.bounds.high[d] - self.bounds.low[d])
+                            worker.d_positions[i][d] / (self.bounds.high[d] - self.bounds.low[d])
                         });
                         gradient.add_point(t, self.unit_gradient(target.ray.at(t), g));
-                        sample += 1;
                     }
                     gradients.push(gradient);
                 }
@@ -421,15 +397,12 @@ impl Dvgo {
     fn losses(&self, group: &mut Group, range: std::ops::Range<usize>, scale: f32) {
         let stage = self.stage();
         let Group { field: worker, tile, rays, backgrounds, loss, squared, .. } = group;
-        let samples = tile.positions.len();
+        let samples = tile.samples.len();
         worker.d_alphas.clear();
         worker.d_alphas.resize(samples, 0.0);
         worker.d_rgb.clear();
         worker.d_rgb.resize(samples, [0.0; 3]);
-        let mut start = 0;
-        for (i, target) in rays[range].iter().enumerate() {
-            let run = start..start + tile.runs[i].0 as usize;
-            start = run.end;
+        for (i, (target, run)) in rays[range].iter().zip(tile.samples.ranges()).enumerate() {
             let found = &tile.composites[i];
             let wanted = match target.mask.filter(|_| self.with_masks) {
                 Some(mask) => std::array::from_fn(|c| mask * target.rgb[c] + (1.0 - mask) * backgrounds[i][c]),
@@ -603,7 +576,7 @@ impl Model for Dvgo {
             .par_chunks(64)
             .map(|rays| {
                 let (mut tile, mut worker) = (Tile::default(), VoxelWorker::default());
-                rays.iter().for_each(|ray| self.march(ray, 0.5, &mut tile));
+                rays.iter().for_each(|ray| self.march(ray, 0.5, &mut tile.samples));
                 self.shade(&mut tile, &mut worker, &vec![[0.0; 3]; rays.len()]);
                 tile.composites.iter().map(|c| c.rgb).collect()
             })

@@ -16,7 +16,7 @@
 //!
 //! The layers, from below:
 //! - kernels: [`simd`] (one matrix product, dispatched at run time), [`mlp`], [`hash_grid`], [`dense_grid`],
-//!   [`encoding`], [`composite`], [`neus_alpha`], [`sampling`], [`adam`]. Derivatives are derived by hand; each module
+//!   [`encoding`], [`ray_samples`], [`composite`], [`neus_alpha`], [`sampling`], [`adam`]. Derivatives are derived by hand; each module
 //!   states its equations, and its tests hold them to finite differences.
 //! - fields: [`radiance_field`] (density and colour on a hash grid), [`voxel_field`] (the same on voxels),
 //!   [`frequency_field`] (the same in one deep network), [`sdf_field`] (distance, exact normals, colour).
@@ -55,6 +55,7 @@ pub mod neus_alpha;
 pub mod neus_original;
 pub mod occupancy;
 pub mod radiance_field;
+pub mod ray_samples;
 pub mod region;
 pub mod results;
 pub mod sampling;

@@ -19,6 +19,7 @@ use crate::hash_grid::HashGridOptions;
 use crate::model::{GROUPS, Level, Model, StepReport, TILE, same_lengths};
 use crate::occupancy::{CELL_MEMORY, OccupancyGrid, TURNS};
 use crate::radiance_field::{RadianceField, RadianceFieldOptions, RadianceParameters, RadianceWorker, Transposed};
+use crate::ray_samples::RaySamples;
 
 /// How a fast NeRF is trained. Lengths are in radii of the region of interest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -93,16 +94,10 @@ impl NerfOptions {
     }
 }
 
-/// Samples of a tile: where they are, how they group into rays, and what they became.
+/// A tile: its samples, and what they became.
 #[derive(Debug, Default)]
 struct Tile {
-    positions: Vec<[f32; 3]>,
-    /// Distance of each sample, and the length of its stretch.
-    depths: Vec<f32>,
-    lengths: Vec<f32>,
-    /// Samples and direction of each ray.
-    runs: Vec<(u32, [f32; 3])>,
-    keep: Vec<u32>,
+    samples: RaySamples<3>,
     alphas: Vec<f32>,
     weights: Vec<f32>,
     composites: Vec<Composite>,
@@ -165,22 +160,19 @@ impl Nerf {
     }
 
     /// Adds a ray's samples to the tile; `jitter` in 0..1 shifts them by a part of a step.
-    fn march(&self, ray: &SceneRay, jitter: f32, tile: &mut Tile) {
+    fn march(&self, ray: &SceneRay, jitter: f32, samples: &mut RaySamples<3>) {
         let o = &self.options;
         let step = |t: f32| (t * o.cone).max(o.step);
         let mut t = o.near + jitter * step(o.near);
-        let before = tile.positions.len();
         while t < o.far {
             let dt = step(t);
             let u = contract(ray.at(t));
             if self.occupancy.is_occupied(u) {
-                tile.positions.push(u);
-                tile.depths.push(t);
-                tile.lengths.push(dt);
+                samples.push(u, t, dt);
             }
             t += dt;
         }
-        tile.runs.push(((tile.positions.len() - before) as u32, ray.direction));
+        samples.end_ray(ray.direction);
     }
 
     /// Drops samples that no light reaches, then computes densities, opacities, colours and composites of the tile.
@@ -193,59 +185,28 @@ impl Nerf {
         seen: Option<&mut Vec<(u32, f32)>>,
     ) {
         let p = &self.parameters;
-        self.field.density(p, &tile.positions, worker);
+        let samples = &mut tile.samples;
+        self.field.density(p, &samples.positions, worker);
         if let Some(seen) = seen {
-            seen.extend(
-                tile.positions.iter().map(|p| self.occupancy.cell(*p) as u32).zip(worker.sigma.iter().copied()),
-            );
+            let cells = samples.positions.iter().map(|p| self.occupancy.cell(*p) as u32);
+            seen.extend(cells.zip(worker.sigma.iter().copied()));
         }
-        tile.keep.clear();
-        let mut first = 0;
-        for run in &mut tile.runs {
-            let last = first + run.0 as usize;
-            let mut light = 1.0;
-            let mut kept = 0;
-            for i in first..last {
-                if light < DARK {
-                    break;
-                }
-                tile.keep.push(i as u32);
-                kept += 1;
-                light *= 1.0 - opacity(worker.sigma[i], tile.lengths[i]);
-            }
-            run.0 = kept;
-            first = last;
-        }
-        if tile.keep.len() < tile.positions.len() {
-            self.field.compact(p, &tile.keep, worker);
-            for (to, from) in tile.keep.iter().enumerate() {
-                tile.positions[to] = tile.positions[*from as usize];
-                tile.depths[to] = tile.depths[*from as usize];
-                tile.lengths[to] = tile.lengths[*from as usize];
-            }
-            tile.positions.truncate(tile.keep.len());
-            tile.depths.truncate(tile.keep.len());
-            tile.lengths.truncate(tile.keep.len());
-        }
-        self.field.color(p, &tile.runs, worker);
         tile.alphas.clear();
-        tile.alphas.extend(worker.sigma.iter().zip(&tile.lengths).map(|(sigma, dt)| opacity(*sigma, *dt)));
+        tile.alphas.extend(worker.sigma.iter().zip(&samples.lengths).map(|(sigma, dt)| opacity(*sigma, *dt)));
+        if let Some(keep) = samples.drop_dark(DARK, |i, _| 1.0 - tile.alphas[i]) {
+            self.field.compact(p, keep, worker);
+            for (to, from) in keep.iter().enumerate() {
+                tile.alphas[to] = tile.alphas[*from as usize];
+            }
+            tile.alphas.truncate(keep.len());
+        }
+        self.field.color(p, &samples.runs, worker);
         tile.weights.resize(tile.alphas.len(), 0.0);
         tile.composites.clear();
-        let mut first = 0;
-        for ((count, _), background) in tile.runs.iter().zip(backgrounds) {
-            let run = first..first + *count as usize;
-            first = run.end;
+        for (run, background) in samples.ranges().zip(backgrounds) {
             let (alphas, rgb) = (&tile.alphas[run.clone()], &worker.rgb[run.clone()]);
             tile.composites.push(composite(alphas, rgb, *background, &mut tile.weights[run]));
         }
-    }
-
-    fn clear(tile: &mut Tile) {
-        tile.positions.clear();
-        tile.depths.clear();
-        tile.lengths.clear();
-        tile.runs.clear();
     }
 
     fn run_group(&self, task: &Task<'_>, rng: &mut Rng, group: &mut Group) {
@@ -256,31 +217,27 @@ impl Nerf {
         let mut next = 0;
         while next < group.rays.len() {
             let first = next;
-            Self::clear(&mut group.tile);
+            group.tile.samples.clear();
             group.backgrounds.clear();
-            while next < group.rays.len() && group.tile.positions.len() < TILE {
+            while next < group.rays.len() && group.tile.samples.len() < TILE {
                 // A random background, so that nothing can hide behind a transparent foreground.
                 group.backgrounds.push(std::array::from_fn(|_| rng.random()));
-                self.march(&group.rays[next].ray, rng.random(), &mut group.tile);
+                self.march(&group.rays[next].ray, rng.random(), &mut group.tile.samples);
                 next += 1;
             }
-            group.marched += group.tile.positions.len();
+            group.marched += group.tile.samples.len();
             self.shade(&mut group.tile, &mut group.field, &group.backgrounds, Some(&mut group.seen));
             self.losses(group, first..next, scale);
-            let Group { field: worker, tile, gradients, .. } = group;
-            self.field.backward(&self.parameters, task.transposed, &tile.positions, worker);
+            let Group { field: worker, tile: Tile { samples, .. }, rays, gradients, .. } = &mut *group;
+            self.field.backward(&self.parameters, task.transposed, &samples.positions, worker);
             if task.move_cameras {
-                self.field.ray_gradients(&self.parameters, &tile.positions, &tile.runs, worker);
-                let mut sample = 0;
-                for (target, ((count, _), d)) in
-                    group.rays[first..next].iter().zip(tile.runs.iter().zip(&worker.d_directions))
-                {
+                self.field.ray_gradients(&self.parameters, &samples.positions, &samples.runs, worker);
+                for ((target, run), d) in rays[first..next].iter().zip(samples.ranges()).zip(&worker.d_directions) {
                     let mut gradient = RayGradient { origin: [0.0; 3], direction: *d };
-                    for i in sample..sample + *count as usize {
-                        let t = tile.depths[i];
+                    for i in run {
+                        let t = samples.depths[i];
                         gradient.add_point(t, contract_gradient(target.ray.at(t), worker.d_positions[i]));
                     }
-                    sample += *count as usize;
                     gradients.push(gradient);
                 }
             }
@@ -294,10 +251,9 @@ impl Nerf {
         worker.d_sigma.resize(tile.alphas.len(), 0.0);
         worker.d_rgb.clear();
         worker.d_rgb.resize(tile.alphas.len(), [0.0; 3]);
-        let (mut start, mut places, mut lengths) = (0, Vec::new(), Vec::new());
-        for (i, target) in rays[range].iter().enumerate() {
-            let run = start..start + tile.runs[i].0 as usize;
-            start = run.end;
+        let samples = &tile.samples;
+        let (mut places, mut lengths) = (Vec::new(), Vec::new());
+        for (i, (target, run)) in rays[range].iter().zip(samples.ranges()).enumerate() {
             let wanted = match target.mask.filter(|_| self.options.object_only) {
                 Some(mask) => std::array::from_fn(|c| mask * target.rgb[c] + (1.0 - mask) * backgrounds[i][c]),
                 None => target.rgb,
@@ -308,9 +264,9 @@ impl Nerf {
             if self.options.distortion > 0.0 {
                 // Distances in units that shrink like disparity: s = t / (1 + t).
                 places.clear();
-                places.extend(tile.depths[run.clone()].iter().map(|t| t / (1.0 + t)));
+                places.extend(samples.depths[run.clone()].iter().map(|t| t / (1.0 + t)));
                 lengths.clear();
-                let stretches = tile.depths[run.clone()].iter().zip(&tile.lengths[run.clone()]);
+                let stretches = samples.depths[run.clone()].iter().zip(&samples.lengths[run.clone()]);
                 lengths.extend(stretches.map(|(t, dt)| dt / ((1.0 + t) * (1.0 + t))));
                 let weight = 3.0 * scale * self.options.distortion;
                 *distorted += f64::from(distortion(&tile.weights[run.clone()], &places, &lengths, weight, d_weights));
@@ -327,7 +283,7 @@ impl Nerf {
             );
         }
         // d alpha / d sigma = dt (1 - alpha).
-        for ((d, alpha), dt) in worker.d_sigma.iter_mut().zip(&tile.alphas).zip(&tile.lengths) {
+        for ((d, alpha), dt) in worker.d_sigma.iter_mut().zip(&tile.alphas).zip(&samples.lengths) {
             *d *= dt * (1.0 - alpha);
         }
     }
@@ -405,18 +361,19 @@ impl Model for Nerf {
             .map(|rays| {
                 let (mut tile, mut worker) = (Tile::default(), RadianceWorker::default());
                 let mut out = Vec::with_capacity(rays.len());
+                let mut shade = |tile: &mut Tile| {
+                    let black = vec![[0.0; 3]; tile.samples.runs.len()];
+                    self.shade(tile, &mut worker, &black, None);
+                    out.extend(tile.composites.iter().map(|c| c.rgb));
+                    tile.samples.clear();
+                };
                 for ray in rays {
-                    self.march(ray, 0.5, &mut tile);
-                    if tile.positions.len() >= TILE {
-                        let black = vec![[0.0; 3]; tile.runs.len()];
-                        self.shade(&mut tile, &mut worker, &black, None);
-                        out.extend(tile.composites.iter().map(|c| c.rgb));
-                        Self::clear(&mut tile);
+                    self.march(ray, 0.5, &mut tile.samples);
+                    if tile.samples.len() >= TILE {
+                        shade(&mut tile);
                     }
                 }
-                let black = vec![[0.0; 3]; tile.runs.len()];
-                self.shade(&mut tile, &mut worker, &black, None);
-                out.extend(tile.composites.iter().map(|c| c.rgb));
+                shade(&mut tile);
                 out
             })
             .collect();

@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::adam::{AdamOptions, Parameters, Schedule};
 use crate::cameras::{CameraResiduals, RayGradient};
-use crate::composite::{Composite, CompositeGradient, composite, composite_backward, opacity};
+use crate::composite::{CompositeGradient, RayComposites, opacity};
 use crate::contraction::{contract, contract_gradient};
 use crate::dataset::{RayDataset, SceneRay, TargetRay};
 use crate::hash_grid::HashGridOptions;
@@ -26,7 +26,9 @@ use crate::model::{GROUPS, Level, Model, StepReport, TILE, same_lengths};
 use crate::neus_alpha::Section;
 use crate::occupancy::{CELL_MEMORY, OccupancyGrid, TURNS};
 use crate::radiance_field::{RadianceField, RadianceFieldOptions, RadianceParameters, RadianceWorker, Transposed};
+use crate::ray_samples::RaySamples;
 use crate::sdf_field::{DirectionEncoding, PositionEncoding, SdfField, SdfFieldOptions, SdfWorker};
+use crate::simd::sigmoid;
 
 /// How a fast NeuS is trained. Lengths are in radii of the region of interest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -143,36 +145,22 @@ impl NeusOptions {
     }
 }
 
-/// Samples of a tile: inside the ball, behind it, and both together ray by ray.
+/// A tile: its samples inside the ball and behind it, and both together ray by ray.
 #[derive(Debug, Default)]
 struct Tile {
-    inner: Vec<[f32; 3]>,
-    inner_t: Vec<f32>,
-    inner_dt: Vec<f32>,
-    inner_runs: Vec<(u32, [f32; 3])>,
-    outer: Vec<[f32; 3]>,
-    outer_t: Vec<f32>,
-    outer_dt: Vec<f32>,
-    outer_runs: Vec<(u32, [f32; 3])>,
-    keep: Vec<u32>,
-    alphas: Vec<f32>,
-    rgb: Vec<[f32; 3]>,
-    weights: Vec<f32>,
-    composites: Vec<Composite>,
-    d_alphas: Vec<f32>,
-    d_rgb: Vec<[f32; 3]>,
+    inner: RaySamples<3>,
+    outer: RaySamples<3>,
+    shown: RayComposites,
 }
 
 impl Tile {
     fn clear(&mut self) {
         self.inner.clear();
-        self.inner_t.clear();
-        self.inner_dt.clear();
-        self.inner_runs.clear();
         self.outer.clear();
-        self.outer_t.clear();
-        self.outer_dt.clear();
-        self.outer_runs.clear();
+    }
+
+    fn len(&self) -> usize {
+        self.inner.len() + self.outer.len()
     }
 }
 
@@ -272,7 +260,6 @@ impl Neus {
 
     fn march(&self, ray: &SceneRay, jitter: f32, tile: &mut Tile) {
         let o = &self.options;
-        let (before_inner, before_outer) = (tile.inner.len(), tile.outer.len());
         let ball = ray.ball(1.0);
         if let Some((near, far)) = ball {
             let dt = (1.0 / self.sharpness()).clamp(o.shortest_step, o.longest_step);
@@ -280,9 +267,7 @@ impl Neus {
             while t < far {
                 let p = ray.at(t);
                 if self.inner_cells.is_occupied(p.map(|c| 0.5 * c + 0.5)) {
-                    tile.inner.push(p);
-                    tile.inner_t.push(t);
-                    tile.inner_dt.push(dt);
+                    tile.inner.push(p, t, dt);
                 }
                 t += dt;
             }
@@ -295,15 +280,13 @@ impl Neus {
                 let dt = step(t);
                 let u = contract(ray.at(t));
                 if self.outer_cells.is_occupied(u) {
-                    tile.outer.push(u);
-                    tile.outer_t.push(t);
-                    tile.outer_dt.push(dt);
+                    tile.outer.push(u, t, dt);
                 }
                 t += dt;
             }
         }
-        tile.inner_runs.push(((tile.inner.len() - before_inner) as u32, ray.direction));
-        tile.outer_runs.push(((tile.outer.len() - before_outer) as u32, ray.direction));
+        tile.inner.end_ray(ray.direction);
+        tile.outer.end_ray(ray.direction);
     }
 
     /// Computes everything of a tile: distances, normals, opacities, colours, composites.
@@ -316,71 +299,35 @@ impl Neus {
         anneal: f32,
     ) {
         let s = self.sharpness();
-        self.field.distance(&tile.inner, sdf);
-        self.drop_dark(tile, sdf, s);
+        let Tile { inner, outer, shown } = tile;
+        self.field.distance(&inner.positions, sdf);
+        // Judged by the drop of the logistic function between neighbours, which needs no normals.
+        let passed = |i: usize, next: Option<usize>| match next {
+            Some(next) => {
+                let (p, q) = (sigmoid(s * sdf.sdf[i]), sigmoid(s * sdf.sdf[next]));
+                ((q + 1e-5) / (p + 1e-5)).min(1.0)
+            }
+            None => 1.0,
+        };
+        if let Some(keep) = inner.drop_dark(DARK, passed) {
+            self.field.compact(keep, sdf);
+        }
         self.field.normals(sdf);
-        self.field.color(&tile.inner_runs, sdf);
+        self.field.color(&inner.runs, sdf);
         if !self.with_masks {
-            self.outside.density(&self.outside_parameters, &tile.outer, outside);
-            self.outside.color(&self.outside_parameters, &tile.outer_runs, outside);
+            self.outside.density(&self.outside_parameters, &outer.positions, outside);
+            self.outside.color(&self.outside_parameters, &outer.runs, outside);
         }
-        tile.alphas.clear();
-        tile.rgb.clear();
-        tile.composites.clear();
-        tile.weights.resize(tile.inner.len() + tile.outer.len(), 0.0);
-        let (mut inner, mut outer) = (0, 0);
-        for (ray, background) in backgrounds.iter().enumerate() {
-            let start = tile.alphas.len();
-            let (count, direction) = tile.inner_runs[ray];
-            for i in inner..inner + count as usize {
-                tile.alphas.push(section(sdf, i, tile.inner_dt[i], direction).alpha(s, anneal));
-                tile.rgb.push(sdf.rgb[i]);
+        shown.clear();
+        let runs = inner.ranges().zip(&inner.runs).zip(outer.ranges());
+        for (((surface, (_, direction)), behind), background) in runs.zip(backgrounds) {
+            for i in surface {
+                shown.push(section(sdf, i, inner.lengths[i], *direction).alpha(s, anneal), sdf.rgb[i]);
             }
-            inner += count as usize;
-            let count = tile.outer_runs[ray].0 as usize;
-            for i in outer..outer + count {
-                tile.alphas.push(opacity(outside.sigma[i], tile.outer_dt[i]));
-                tile.rgb.push(outside.rgb[i]);
+            for i in behind {
+                shown.push(opacity(outside.sigma[i], outer.lengths[i]), outside.rgb[i]);
             }
-            outer += count;
-            let weights = &mut tile.weights[start..tile.alphas.len()];
-            tile.composites.push(composite(&tile.alphas[start..], &tile.rgb[start..], *background, weights));
-        }
-    }
-
-    /// Drops inner samples that no light reaches, judged by the drop of the logistic function between neighbours, which
-    /// needs no normals.
-    fn drop_dark(&self, tile: &mut Tile, sdf: &mut SdfWorker, s: f32) {
-        tile.keep.clear();
-        let mut first = 0;
-        for run in &mut tile.inner_runs {
-            let last = first + run.0 as usize;
-            let mut light = 1.0;
-            let mut kept = 0;
-            for i in first..last {
-                if light < DARK {
-                    break;
-                }
-                tile.keep.push(i as u32);
-                kept += 1;
-                if i + 1 < last {
-                    let (p, q) = (crate::simd::sigmoid(s * sdf.sdf[i]), crate::simd::sigmoid(s * sdf.sdf[i + 1]));
-                    light *= ((q + 1e-5) / (p + 1e-5)).min(1.0);
-                }
-            }
-            run.0 = kept;
-            first = last;
-        }
-        if tile.keep.len() < tile.inner.len() {
-            self.field.compact(&tile.keep, sdf);
-            for (to, from) in tile.keep.iter().enumerate() {
-                tile.inner[to] = tile.inner[*from as usize];
-                tile.inner_t[to] = tile.inner_t[*from as usize];
-                tile.inner_dt[to] = tile.inner_dt[*from as usize];
-            }
-            tile.inner.truncate(tile.keep.len());
-            tile.inner_t.truncate(tile.keep.len());
-            tile.inner_dt.truncate(tile.keep.len());
+            shown.end_ray(*background);
         }
     }
 
@@ -394,7 +341,7 @@ impl Neus {
             let first = next;
             group.tile.clear();
             group.backgrounds.clear();
-            while next < group.rays.len() && group.tile.inner.len() + group.tile.outer.len() < TILE {
+            while next < group.rays.len() && group.tile.len() < TILE {
                 let background = if self.with_masks { [0.0; 3] } else { std::array::from_fn(|_| rng.random()) };
                 group.backgrounds.push(background);
                 self.march(&group.rays[next].ray, rng.random(), &mut group.tile);
@@ -403,12 +350,13 @@ impl Neus {
             group.marched += group.tile.inner.len();
             let Group { sdf, outside, tile, backgrounds, seen, .. } = group;
             self.shade(tile, sdf, outside, backgrounds, anneal);
-            let cells = tile.outer.iter().map(|u| self.outer_cells.cell(*u) as u32);
+            let cells = tile.outer.positions.iter().map(|u| self.outer_cells.cell(*u) as u32);
             seen.extend(cells.zip(outside.sigma.iter().copied()));
             self.losses(group, first..next, rays);
             self.send_back(group, anneal, rays);
             if !self.with_masks {
-                self.outside.backward(&self.outside_parameters, task.transposed, &group.tile.outer, &mut group.outside);
+                let Group { outside, tile, .. } = &mut *group;
+                self.outside.backward(&self.outside_parameters, task.transposed, &tile.outer.positions, outside);
             }
             self.field.backward(&mut group.sdf);
             if task.move_cameras {
@@ -421,30 +369,22 @@ impl Neus {
     /// What the losses ask of the tile's rays: through the samples' positions (their distances stay), the encoded
     /// direction, and the cosine between direction and normal.
     fn ray_gradients(&self, group: &mut Group, range: std::ops::Range<usize>) {
-        let Group { sdf, outside, tile, rays, gradients, d_cosines, .. } = group;
-        self.field.ray_gradients(&tile.inner_runs, sdf);
+        let Group { sdf, outside, tile: Tile { inner, outer, .. }, rays, gradients, d_cosines, .. } = group;
+        self.field.ray_gradients(&inner.runs, sdf);
         if !self.with_masks {
-            self.outside.ray_gradients(&self.outside_parameters, &tile.outer, &tile.outer_runs, outside);
+            self.outside.ray_gradients(&self.outside_parameters, &outer.positions, &outer.runs, outside);
         }
-        let (mut inner, mut outer) = (0, 0);
-        for (ray, target) in rays[range].iter().enumerate() {
-            let mut gradient = RayGradient { origin: [0.0; 3], direction: sdf.d_directions[ray] };
-            for i in inner..inner + tile.inner_runs[ray].0 as usize {
-                gradient.add_point(tile.inner_t[i], sdf.d_positions[i]);
-                for d in 0..3 {
-                    gradient.direction[d] += d_cosines[i] * sdf.normals[i][d];
-                }
-            }
-            inner += tile.inner_runs[ray].0 as usize;
+        let runs = inner.ranges().zip(outer.ranges());
+        for (ray, (target, (surface, behind))) in rays[range].iter().zip(runs).enumerate() {
+            let mut gradient = surface_ray_gradient(sdf, ray, surface, &inner.depths, d_cosines);
             if !self.with_masks {
                 for d in 0..3 {
                     gradient.direction[d] += outside.d_directions[ray][d];
                 }
-                for i in outer..outer + tile.outer_runs[ray].0 as usize {
-                    let t = tile.outer_t[i];
+                for i in behind {
+                    let t = outer.depths[i];
                     gradient.add_point(t, contract_gradient(target.ray.at(t), outside.d_positions[i]));
                 }
-                outer += tile.outer_runs[ray].0 as usize;
             }
             gradients.push(gradient);
         }
@@ -453,44 +393,28 @@ impl Neus {
     /// The loss of each ray, and its derivatives with respect to opacities and colours.
     fn losses(&self, group: &mut Group, range: std::ops::Range<usize>, rays: usize) {
         let scale = 1.0 / (rays * GROUPS) as f32;
-        let tile = &mut group.tile;
-        tile.d_alphas.clear();
-        tile.d_alphas.resize(tile.alphas.len(), 0.0);
-        tile.d_rgb.clear();
-        tile.d_rgb.resize(tile.alphas.len(), [0.0; 3]);
-        let mut start = 0;
+        let shown = &mut group.tile.shown;
         for (i, target) in group.rays[range].iter().enumerate() {
-            let run = start..start + (tile.inner_runs[i].0 + tile.outer_runs[i].0) as usize;
-            start = run.end;
-            let found = &tile.composites[i];
+            let found = shown.rays[i];
             let mask = target.mask.filter(|_| self.with_masks);
             let wanted = target.rgb.map(|c| c * mask.unwrap_or(1.0));
             let error: [f32; 3] = std::array::from_fn(|c| found.rgb[c] - wanted[c]);
             group.squared += error.iter().map(|e| f64::from(e * e)).sum::<f64>();
             group.loss += error.iter().map(|e| f64::from(e.abs())).sum::<f64>() / 3.0;
-            let mut gradient =
-                CompositeGradient { d_rgb: error.map(|e| e.signum() * scale / 3.0), d_transmittance: 0.0 };
-            if let Some(mask) = mask {
-                let cover = (1.0 - found.transmittance).clamp(1e-3, 1.0 - 1e-3);
-                group.loss -= f64::from(self.options.mask * (mask * cover.ln() + (1.0 - mask) * (1.0 - cover).ln()));
-                gradient.d_transmittance = self.options.mask * scale * (mask / cover - (1.0 - mask) / (1.0 - cover));
-            }
-            composite_backward(
-                &tile.alphas[run.clone()],
-                &tile.rgb[run.clone()],
-                group.backgrounds[i],
-                &tile.weights[run.clone()],
-                &gradient,
-                &mut tile.d_alphas[run.clone()],
-                &mut tile.d_rgb[run],
-            );
+            let (loss, pull) = mask.map_or((0.0, 0.0), |mask| mask_loss(found.transmittance, mask));
+            group.loss += f64::from(self.options.mask * loss);
+            let gradient = CompositeGradient {
+                d_rgb: error.map(|e| e.signum() * scale / 3.0),
+                d_transmittance: self.options.mask * scale * pull,
+            };
+            shown.send_back(i, &gradient);
         }
     }
 
     /// From opacities and colours back to distance, normal, sharpness, density; adds the eikonal loss.
     fn send_back(&self, group: &mut Group, anneal: f32, rays: usize) {
         let s = self.sharpness();
-        let Group { sdf, outside, tile, d_cosines, .. } = group;
+        let Group { sdf, outside, tile: Tile { inner, outer, shown }, d_cosines, .. } = group;
         d_cosines.clear();
         let samples = rays as f32 * GROUPS as f32 * self.samples_per_ray[0].max(1.0);
         for d in [&mut sdf.d_rgb, &mut sdf.d_normals] {
@@ -499,12 +423,11 @@ impl Neus {
         sdf.d_sdf.clear();
         outside.d_sigma.clear();
         outside.d_rgb.clear();
-        let (mut at, mut inner, mut outer) = (0, 0, 0);
-        for ray in 0..tile.inner_runs.len() {
-            let (count, direction) = tile.inner_runs[ray];
-            for i in inner..inner + count as usize {
-                let derivative = section(sdf, i, tile.inner_dt[i], direction).gradient(s, anneal);
-                let d_alpha = tile.d_alphas[at];
+        let mut at = 0;
+        for ((surface, (_, direction)), behind) in inner.ranges().zip(&inner.runs).zip(outer.ranges()) {
+            for i in surface {
+                let derivative = section(sdf, i, inner.lengths[i], *direction).gradient(s, anneal);
+                let d_alpha = shown.d_alphas[at];
                 sdf.d_sdf.push(d_alpha * derivative.sdf);
                 group.d_sharpness += d_alpha * derivative.sharpness;
                 let (loss, pull) = eikonal(sdf.normals[i], self.options.eikonal / samples);
@@ -512,17 +435,14 @@ impl Neus {
                 let d_cosine = d_alpha * derivative.cosine;
                 sdf.d_normals.push(std::array::from_fn(|d| d_cosine * direction[d] + pull[d]));
                 d_cosines.push(d_cosine);
-                sdf.d_rgb.push(tile.d_rgb[at]);
+                sdf.d_rgb.push(shown.d_colors[at]);
                 at += 1;
             }
-            inner += count as usize;
-            let count = tile.outer_runs[ray].0 as usize;
-            for i in outer..outer + count {
-                outside.d_sigma.push(tile.d_alphas[at] * tile.outer_dt[i] * (1.0 - tile.alphas[at]));
-                outside.d_rgb.push(tile.d_rgb[at]);
+            for i in behind {
+                outside.d_sigma.push(shown.d_alphas[at] * outer.lengths[i] * (1.0 - shown.alphas[at]));
+                outside.d_rgb.push(shown.d_colors[at]);
                 at += 1;
             }
-            outer += count;
         }
     }
 
@@ -582,6 +502,31 @@ pub(crate) fn section(sdf: &SdfWorker, i: usize, dt: f32, direction: [f32; 3]) -
 pub(crate) fn eikonal(n: [f32; 3], weight: f32) -> (f32, [f32; 3]) {
     let norm = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt().max(1e-6);
     (weight * (norm - 1.0) * (norm - 1.0), n.map(|c| 2.0 * weight * (norm - 1.0) / norm * c))
+}
+
+/// How badly the light that passes a ray fits its mask: the binary cross-entropy of `1 - transmittance`, and its derivative by
+/// the transmittance.
+pub(crate) fn mask_loss(transmittance: f32, mask: f32) -> (f32, f32) {
+    let cover = (1.0 - transmittance).clamp(1e-3, 1.0 - 1e-3);
+    (-(mask * cover.ln() + (1.0 - mask) * (1.0 - cover).ln()), mask / cover - (1.0 - mask) / (1.0 - cover))
+}
+
+/// What the losses ask of ray number `ray` through its samples of the surface.
+pub(crate) fn surface_ray_gradient(
+    sdf: &SdfWorker,
+    ray: usize,
+    samples: std::ops::Range<usize>,
+    depths: &[f32],
+    d_cosines: &[f32],
+) -> RayGradient {
+    let mut gradient = RayGradient { origin: [0.0; 3], direction: sdf.d_directions[ray] };
+    for i in samples {
+        gradient.add_point(depths[i], sdf.d_positions[i]);
+        for d in 0..3 {
+            gradient.direction[d] += d_cosines[i] * sdf.normals[i][d];
+        }
+    }
+    gradient
 }
 
 impl Model for Neus {
@@ -649,13 +594,13 @@ impl Model for Neus {
                 while first < rays.len() {
                     group.tile.clear();
                     let mut next = first;
-                    while next < rays.len() && group.tile.inner.len() + group.tile.outer.len() < TILE {
+                    while next < rays.len() && group.tile.len() < TILE {
                         self.march(&rays[next], 0.5, &mut group.tile);
                         next += 1;
                     }
                     let black = vec![[0.0; 3]; next - first];
                     self.shade(&mut group.tile, &mut group.sdf, &mut group.outside, &black, 1.0);
-                    out.extend(group.tile.composites.iter().map(|c| c.rgb));
+                    out.extend(group.tile.shown.rays.iter().map(|c| c.rgb));
                     first = next;
                 }
                 out

@@ -17,13 +17,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::adam::{AdamOptions, Parameters, Schedule};
 use crate::cameras::{CameraResiduals, RayGradient};
-use crate::composite::{Composite, CompositeGradient, composite, composite_backward, opacity};
+use crate::composite::{CompositeGradient, RayComposites, opacity};
 use crate::dataset::{RayDataset, SceneRay, TargetRay};
 use crate::frequency_field::{
     DensityActivation, FrequencyField, FrequencyFieldOptions, FrequencyParameters, FrequencyTransposed, FrequencyWorker,
 };
 use crate::model::{GROUPS, Level, Model, StepReport, same_lengths};
-use crate::neus::{eikonal, section};
+use crate::neus::{eikonal, mask_loss, section, surface_ray_gradient};
+use crate::ray_samples::RaySamples;
 use crate::sampling::importance;
 use crate::sdf_field::{SdfField, SdfFieldOptions, SdfWorker};
 use crate::simd::sigmoid;
@@ -115,23 +116,12 @@ enum Slot {
 /// Sections of a tile: those that the surface is asked for, those of the background, and which of them each ray shows.
 #[derive(Debug, Default)]
 struct Tile {
-    inner: Vec<[f32; 3]>,
-    inner_t: Vec<f32>,
-    inner_dt: Vec<f32>,
-    inner_runs: Vec<(u32, [f32; 3])>,
-    outer: Vec<[f32; 4]>,
-    outer_t: Vec<f32>,
-    outer_dt: Vec<f32>,
-    outer_runs: Vec<(u32, [f32; 3])>,
+    inner: RaySamples<3>,
+    outer: RaySamples<4>,
     slots: Vec<Slot>,
     /// Slots of each ray.
     counts: Vec<usize>,
-    alphas: Vec<f32>,
-    rgb: Vec<[f32; 3]>,
-    weights: Vec<f32>,
-    composites: Vec<Composite>,
-    d_alphas: Vec<f32>,
-    d_rgb: Vec<[f32; 3]>,
+    shown: RayComposites,
 }
 
 #[derive(Debug, Default)]
@@ -243,7 +233,6 @@ impl NeusOriginal {
                 starts.push((middle + 1.0) / u + 1.0 / o.samples as f32);
             }
         }
-        let (mut inner, mut outer) = (0, 0);
         for (i, start) in starts.iter().enumerate() {
             let dt = starts.get(i + 1).map_or(last, |next| next - start);
             let t = start + 0.5 * dt;
@@ -251,71 +240,52 @@ impl NeusOriginal {
             let norm = p.iter().map(|c| c * c).sum::<f32>().sqrt();
             let shows_surface = i < inner_sections && (self.with_masks || norm < 1.0);
             if i < inner_sections && (self.with_masks || norm < RELAXED) {
-                tile.inner.push(p);
-                tile.inner_t.push(t);
-                tile.inner_dt.push(dt);
-                inner += 1;
+                tile.inner.push(p, t, dt);
             }
             if shows_surface {
                 tile.slots.push(Slot::Inner(tile.inner.len() - 1));
             } else {
                 let norm = norm.max(1.0);
                 tile.slots.push(Slot::Outer(tile.outer.len()));
-                tile.outer.push([p[0] / norm, p[1] / norm, p[2] / norm, 1.0 / norm]);
-                tile.outer_t.push(t);
-                tile.outer_dt.push(dt);
-                outer += 1;
+                tile.outer.push([p[0] / norm, p[1] / norm, p[2] / norm, 1.0 / norm], t, dt);
             }
         }
-        tile.inner_runs.push((inner, ray.direction));
-        tile.outer_runs.push((outer, ray.direction));
+        tile.inner.end_ray(ray.direction);
+        tile.outer.end_ray(ray.direction);
         tile.counts.push(starts.len());
     }
 
     /// Samples and renders some rays into the group's tile.
     fn shade(&self, rays: &[SceneRay], mut rng: Option<&mut Rng>, anneal: f32, group: &mut Group) {
         let Group { sdf, probe, outside, tile, .. } = group;
-        for list in [&mut tile.inner_t, &mut tile.inner_dt, &mut tile.outer_t, &mut tile.outer_dt, &mut tile.alphas] {
-            list.clear();
-        }
         tile.inner.clear();
         tile.outer.clear();
-        tile.inner_runs.clear();
-        tile.outer_runs.clear();
         tile.slots.clear();
         tile.counts.clear();
-        tile.rgb.clear();
-        tile.composites.clear();
+        tile.shown.clear();
         for ray in rays {
             self.place(ray, rng.as_deref_mut(), probe, tile);
         }
         let s = self.sharpness();
-        self.field.distance(&tile.inner, sdf);
+        let Tile { inner, outer, slots, counts, shown } = tile;
+        self.field.distance(&inner.positions, sdf);
         self.field.normals(sdf);
-        self.field.color(&tile.inner_runs, sdf);
-        self.outside.density(&self.outside_parameters, &tile.outer, outside);
-        self.outside.color(&self.outside_parameters, &tile.outer_runs, outside);
-        let (mut at, mut ray) = (0, 0);
-        for count in &tile.counts {
-            let direction = rays[ray].direction;
-            ray += 1;
-            for slot in &tile.slots[at..at + count] {
-                let (alpha, rgb) = match *slot {
-                    Slot::Inner(i) => (section(sdf, i, tile.inner_dt[i], direction).alpha(s, anneal), sdf.rgb[i]),
-                    Slot::Outer(i) => (opacity(outside.sigma[i], tile.outer_dt[i]), outside.rgb[i]),
-                };
-                tile.alphas.push(alpha);
-                tile.rgb.push(rgb);
+        self.field.color(&inner.runs, sdf);
+        self.outside.density(&self.outside_parameters, &outer.positions, outside);
+        self.outside.color(&self.outside_parameters, &outer.runs, outside);
+        let mut at = 0;
+        for (ray, count) in rays.iter().zip(counts) {
+            for slot in &slots[at..at + *count] {
+                match *slot {
+                    Slot::Inner(i) => {
+                        let section = section(sdf, i, inner.lengths[i], ray.direction);
+                        shown.push(section.alpha(s, anneal), sdf.rgb[i]);
+                    }
+                    Slot::Outer(i) => shown.push(opacity(outside.sigma[i], outer.lengths[i]), outside.rgb[i]),
+                }
             }
-            at += count;
-        }
-        tile.weights.resize(tile.alphas.len(), 0.0);
-        at = 0;
-        for count in &tile.counts {
-            let run = at..at + count;
-            at = run.end;
-            let found = composite(&tile.alphas[run.clone()], &tile.rgb[run.clone()], [0.0; 3], &mut tile.weights[run]);
-            tile.composites.push(found);
+            shown.end_ray([0.0; 3]);
+            at += *count;
         }
     }
 
@@ -350,77 +320,58 @@ impl NeusOriginal {
 
     /// The loss of each ray, and its derivatives with respect to opacities and colours.
     fn losses(&self, group: &mut Group, range: std::ops::Range<usize>, scale: f32) {
-        let tile = &mut group.tile;
-        tile.d_alphas.clear();
-        tile.d_alphas.resize(tile.alphas.len(), 0.0);
-        tile.d_rgb.clear();
-        tile.d_rgb.resize(tile.alphas.len(), [0.0; 3]);
-        let mut start = 0;
+        let shown = &mut group.tile.shown;
         for (i, target) in group.rays[range].iter().enumerate() {
-            let run = start..start + tile.counts[i];
-            start = run.end;
-            let found = &tile.composites[i];
+            let found = shown.rays[i];
             let mask = target.mask.filter(|_| self.with_masks);
             // With masks only rays through the object count for the colour, as the authors weigh them.
             let share = mask.unwrap_or(1.0);
             let error: [f32; 3] = std::array::from_fn(|c| (found.rgb[c] - target.rgb[c]) * share);
             group.squared += error.iter().map(|e| f64::from(e * e)).sum::<f64>();
             group.loss += error.iter().map(|e| f64::from(e.abs())).sum::<f64>();
-            let mut gradient = CompositeGradient {
+            let (loss, pull) = mask.map_or((0.0, 0.0), |mask| mask_loss(found.transmittance, mask));
+            group.loss += f64::from(self.options.mask * loss);
+            let gradient = CompositeGradient {
                 d_rgb: error.map(|e| if e == 0.0 { 0.0 } else { e.signum() * scale * share }),
-                d_transmittance: 0.0,
+                d_transmittance: self.options.mask * scale * pull,
             };
-            if let Some(mask) = mask {
-                let cover = (1.0 - found.transmittance).clamp(1e-3, 1.0 - 1e-3);
-                group.loss -= f64::from(self.options.mask * (mask * cover.ln() + (1.0 - mask) * (1.0 - cover).ln()));
-                gradient.d_transmittance = self.options.mask * scale * (mask / cover - (1.0 - mask) / (1.0 - cover));
-            }
-            composite_backward(
-                &tile.alphas[run.clone()],
-                &tile.rgb[run.clone()],
-                [0.0; 3],
-                &tile.weights[run.clone()],
-                &gradient,
-                &mut tile.d_alphas[run.clone()],
-                &mut tile.d_rgb[run],
-            );
+            shown.send_back(i, &gradient);
         }
     }
 
     /// From opacities and colours back to distance, normal, sharpness and density; adds the eikonal loss.
     fn send_back(&self, group: &mut Group, rays: &[SceneRay], anneal: f32, scale: f32) {
         let s = self.sharpness();
-        let Group { sdf, outside, tile, d_cosines, .. } = group;
-        let inner = tile.inner.len();
+        let Group { sdf, outside, tile: Tile { inner, outer, slots, counts, shown }, d_cosines, .. } = group;
         let near = |p: &[f32; 3]| p.iter().map(|c| c * c).sum::<f32>().sqrt() < RELAXED;
-        let relaxed = tile.inner.iter().filter(|p| near(p)).count();
+        let relaxed = inner.positions.iter().filter(|p| near(p)).count();
         // The mean over the sections of these rays stands for the mean over all.
         let weight = self.options.eikonal * scale * rays.len() as f32 / (relaxed as f32 + 1e-5);
         sdf.d_sdf.clear();
-        sdf.d_sdf.resize(inner, 0.0);
+        sdf.d_sdf.resize(inner.len(), 0.0);
         sdf.d_rgb.clear();
-        sdf.d_rgb.resize(inner, [0.0; 3]);
+        sdf.d_rgb.resize(inner.len(), [0.0; 3]);
         sdf.d_normals.clear();
         d_cosines.clear();
-        d_cosines.resize(inner, 0.0);
-        for (p, n) in tile.inner.iter().zip(&sdf.normals) {
+        d_cosines.resize(inner.len(), 0.0);
+        for (p, n) in inner.positions.iter().zip(&sdf.normals) {
             let (loss, pull) = if near(p) { eikonal(*n, weight) } else { (0.0, [0.0; 3]) };
             group.loss += f64::from(loss / scale);
             sdf.d_normals.push(pull);
         }
         outside.d_sigma.clear();
-        outside.d_sigma.resize(tile.outer.len(), 0.0);
+        outside.d_sigma.resize(outer.len(), 0.0);
         outside.d_rgb.clear();
-        outside.d_rgb.resize(tile.outer.len(), [0.0; 3]);
+        outside.d_rgb.resize(outer.len(), [0.0; 3]);
         let mut at = 0;
-        for (ray, count) in rays.iter().zip(&tile.counts) {
-            for slot in at..at + count {
-                let d_alpha = tile.d_alphas[slot];
-                match tile.slots[slot] {
+        for (ray, count) in rays.iter().zip(counts) {
+            for slot in at..at + *count {
+                let d_alpha = shown.d_alphas[slot];
+                match slots[slot] {
                     Slot::Inner(i) => {
-                        let derivative = section(sdf, i, tile.inner_dt[i], ray.direction).gradient(s, anneal);
+                        let derivative = section(sdf, i, inner.lengths[i], ray.direction).gradient(s, anneal);
                         sdf.d_sdf[i] = d_alpha * derivative.sdf;
-                        sdf.d_rgb[i] = tile.d_rgb[slot];
+                        sdf.d_rgb[i] = shown.d_colors[slot];
                         group.d_sharpness += d_alpha * derivative.sharpness;
                         d_cosines[i] = d_alpha * derivative.cosine;
                         for d in 0..3 {
@@ -428,37 +379,29 @@ impl NeusOriginal {
                         }
                     }
                     Slot::Outer(i) => {
-                        outside.d_sigma[i] = d_alpha * tile.outer_dt[i] * (1.0 - tile.alphas[slot]);
-                        outside.d_rgb[i] = tile.d_rgb[slot];
+                        outside.d_sigma[i] = d_alpha * outer.lengths[i] * (1.0 - shown.alphas[slot]);
+                        outside.d_rgb[i] = shown.d_colors[slot];
                     }
                 }
             }
-            at += count;
+            at += *count;
         }
     }
 
     fn ray_gradients(&self, group: &mut Group, range: std::ops::Range<usize>) {
-        let Group { sdf, outside, tile, rays, gradients, d_cosines, .. } = group;
-        self.field.ray_gradients(&tile.inner_runs, sdf);
-        self.outside.ray_gradients(&tile.outer_runs, outside);
-        let (mut inner, mut outer) = (0, 0);
-        for (ray, target) in rays[range].iter().enumerate() {
-            let mut gradient = RayGradient {
-                origin: [0.0; 3],
-                direction: std::array::from_fn(|d| sdf.d_directions[ray][d] + outside.d_directions[ray][d]),
-            };
-            for i in inner..inner + tile.inner_runs[ray].0 as usize {
-                gradient.add_point(tile.inner_t[i], sdf.d_positions[i]);
-                for d in 0..3 {
-                    gradient.direction[d] += d_cosines[i] * sdf.normals[i][d];
-                }
+        let Group { sdf, outside, tile: Tile { inner, outer, .. }, rays, gradients, d_cosines, .. } = group;
+        self.field.ray_gradients(&inner.runs, sdf);
+        self.outside.ray_gradients(&outer.runs, outside);
+        let runs = inner.ranges().zip(outer.ranges());
+        for (ray, (target, (surface, behind))) in rays[range].iter().zip(runs).enumerate() {
+            let mut gradient = surface_ray_gradient(sdf, ray, surface, &inner.depths, d_cosines);
+            for d in 0..3 {
+                gradient.direction[d] += outside.d_directions[ray][d];
             }
-            inner += tile.inner_runs[ray].0 as usize;
-            for i in outer..outer + tile.outer_runs[ray].0 as usize {
-                let t = tile.outer_t[i];
+            for i in behind {
+                let t = outer.depths[i];
                 gradient.add_point(t, inverted_gradient(target.ray.at(t), outside.d_positions[i]));
             }
-            outer += tile.outer_runs[ray].0 as usize;
             gradients.push(gradient);
         }
     }
@@ -547,7 +490,7 @@ impl Model for NeusOriginal {
                 let mut group = Group::default();
                 let tiles = rays.chunks(TILE_RAYS).flat_map(|tile| {
                     self.shade(tile, None, 1.0, &mut group);
-                    group.tile.composites.iter().map(|c| c.rgb).collect::<Vec<_>>()
+                    group.tile.shown.rays.iter().map(|c| c.rgb).collect::<Vec<_>>()
                 });
                 tiles.collect()
             })
