@@ -108,14 +108,14 @@ fn step_after_step_gives_the_picture_that_all_at_once_gives() {
 #[test]
 fn each_look_does_what_it_says() {
     let red = Block::new([-0.05, 0.0, -0.05], [0.05, 0.06, 0.05], [200, 30, 20], 255);
-    let (top, beside) = ([0.0, 0.06, 0.0], [0.12, 0.0, 0.12]);
+    let top = [0.0, 0.06, 0.0];
     let plain = drawn(std::slice::from_ref(&red), |_| PLAIN);
-    assert_eq!(pixel_at(&plain, beside), [0; 4], "nothing is transparent");
+    assert_eq!(plain[(0, 0)], [0; 4], "nothing is transparent");
     let [r, g, b, a] = pixel_at(&plain, top);
     assert!(a == 255 && r > 150 && g < 60 && b < 60, "{:?}", [r, g, b, a]);
     // Edges are dark, also the one between two sides of the same colour.
-    let [r, ..] = pixel_at(&plain, [-0.05, 0.06, 0.0]);
-    assert!(r < 90, "{r}");
+    let [edge_r, ..] = pixel_at(&plain, [-0.05, 0.06, 0.0]);
+    assert!(edge_r < 110, "{edge_r}");
     let faded = drawn(std::slice::from_ref(&red), |_| Look { fade: 0.5, ..PLAIN });
     let [faded_r, faded_g, ..] = pixel_at(&faded, top);
     assert!(faded_g > 120 && faded_r > r, "{faded_r} {faded_g}");
@@ -130,15 +130,15 @@ fn each_look_does_what_it_says() {
 #[test]
 fn what_is_hidden_is_not_drawn_and_what_is_behind_glass_shines_through() {
     let wall = |opacity| Block::new([-0.08, 0.0, 0.02], [0.08, 0.16, 0.04], [255, 255, 255], opacity);
-    let behind = Block::new([-0.03, 0.02, -0.06], [0.03, 0.05, -0.03], [0, 0, 255], 255);
+    let behind = Block::new([0.0, 0.02, -0.06], [0.05, 0.05, -0.03], [0, 0, 255], 255);
     // The place on the wall's front before the block's middle.
     let forward = Vector3::new(0.5, -0.6, -0.7);
-    let middle = Vector3::new(0.0, 0.035, -0.03);
+    let middle = Vector3::new(0.025, 0.035, -0.03);
     let on_wall: [f64; 3] = (middle - forward * ((middle.z - 0.04) / forward.z)).into();
     let alone = drawn(&[wall(255)], |_| PLAIN);
     let hidden = drawn(&[behind, wall(255)], |_| PLAIN);
-    assert_eq!(hidden, alone);
-    let behind = Block::new([-0.03, 0.02, -0.06], [0.03, 0.05, -0.03], [0, 0, 255], 255);
+    assert!(hidden == alone);
+    let behind = Block::new([0.0, 0.02, -0.06], [0.05, 0.05, -0.03], [0, 0, 255], 255);
     let [r, _, b, _] = pixel_at(&drawn(&[behind, wall(100)], |_| PLAIN), on_wall);
     assert!(b > r + 40, "{r} {b}");
 }
