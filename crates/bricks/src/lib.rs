@@ -60,7 +60,7 @@ pub use ldraw::file::{
 pub use ldraw::library::PartLibrary;
 pub use ldraw::load::MissingPart;
 pub use ldraw::shape::PartShape;
-pub use model::{Model, Occurrence, PartInstance, ReadOptions};
+pub use model::{MissingBrick, Model, Occurrence, PartInstance, ReadOptions};
 pub use parametric::drawable_parts;
 pub use random::{
     BatchSummary, MostAlike, RandomModel, RandomOptions, RandomProfile, RandomSummary, Spread, Style, random_model,

@@ -27,6 +27,15 @@ pub struct PartInstance {
     pub reference: usize,
 }
 
+/// A brick whose part is nowhere: only its line says anything about it.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct MissingBrick {
+    /// The name that was looked for.
+    pub name: String,
+    /// Its colour.
+    pub color: ColorCode,
+}
+
 /// One use of a submodel; the first is the model itself.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Occurrence {
@@ -57,6 +66,7 @@ pub struct Model {
     reachable: Vec<FileId>,
     colors: ColorTable,
     missing: Vec<MissingPart>,
+    missing_bricks: Vec<MissingBrick>,
     warnings: Vec<String>,
     occurrences: Vec<Occurrence>,
     instances: Vec<PartInstance>,
@@ -93,7 +103,8 @@ impl Model {
 
     fn assemble(path: PathBuf, loaded: Loaded) -> Result<Self> {
         let Loaded { files, reachable, colors, missing, warnings } = loaded;
-        let mut placing = Placing { files: &files, occurrences: vec![], instances: vec![], missing: vec![] };
+        let mut placing =
+            Placing { files: &files, occurrences: vec![], instances: vec![], missing: vec![], missing_bricks: vec![] };
         let root = Occurrence {
             file: FileId(0),
             parent: None,
@@ -102,11 +113,11 @@ impl Model {
             inverted: false,
         };
         placing.submodel(root)?;
-        let Placing { occurrences, instances, missing: mut missing_in_model, .. } = placing;
+        let Placing { occurrences, instances, missing: mut missing_in_model, missing_bricks, .. } = placing;
         let in_parts = missing.into_iter().filter(|(file, _)| !occurrences.iter().any(|o| o.file == *file));
         missing_in_model.extend(in_parts.map(|(file, index)| MissingPart::of(&files[file.index()], index)));
         let missing = missing_in_model;
-        Ok(Self { path, files, reachable, colors, missing, warnings, occurrences, instances })
+        Ok(Self { path, files, reachable, colors, missing, missing_bricks, warnings, occurrences, instances })
     }
 
     /// Where it was read.
@@ -142,6 +153,11 @@ impl Model {
     /// References to files that are nowhere, in order.
     pub fn missing(&self) -> &[MissingPart] {
         &self.missing
+    }
+
+    /// The bricks that are left out because their parts are nowhere, every use of their submodels counted.
+    pub fn missing_bricks(&self) -> &[MissingBrick] {
+        &self.missing_bricks
     }
 
     /// What is odd about the files, for people.
@@ -193,6 +209,7 @@ struct Placing<'a> {
     occurrences: Vec<Occurrence>,
     instances: Vec<PartInstance>,
     missing: Vec<MissingPart>,
+    missing_bricks: Vec<MissingBrick>,
 }
 
 impl Placing<'_> {
@@ -215,6 +232,8 @@ impl Placing<'_> {
         for (reference_index, reference) in file.references.iter().enumerate() {
             let Some(target) = reference.target else {
                 self.missing.push(MissingPart::of(file, reference_index));
+                let color = reference.color.within(occurrence.color);
+                self.missing_bricks.push(MissingBrick { name: reference.name.clone(), color });
                 continue;
             };
             let placed = occurrence.ldraw_from_file.then_inner(&reference.parent_from_child);

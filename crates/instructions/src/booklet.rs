@@ -79,6 +79,8 @@ pub struct BookletSummary {
     pub parts: usize,
     /// Different bricks: part and colour.
     pub distinct_parts: usize,
+    /// Bricks whose parts are nowhere: the parts list names them, no step adds them.
+    pub missing_parts: usize,
     /// Sections whose steps are ours, because the author gave none.
     pub automatic_sections: usize,
     /// How often the view changes from one step to the next.
@@ -139,6 +141,7 @@ pub fn booklet(model: &Model, plan: &Plan, form: Form, progress: &dyn Progress) 
         submodels: plan.sections.len().saturating_sub(1),
         parts: totals.iter().map(|(_, count)| count).sum(),
         distinct_parts: totals.len(),
+        missing_parts: plan.missing.iter().map(|(_, count)| count).sum(),
         automatic_sections: plan.sections.iter().filter(|section| section.automatic).count(),
         view_changes: book.view_changes,
         bytes: bytes.len(),

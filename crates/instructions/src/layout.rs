@@ -67,6 +67,17 @@ struct Layout<'a> {
     view_changes: usize,
 }
 
+/// A line of the parts list.
+struct ListLine {
+    /// `None` where the part is missing.
+    picture: Option<PictureId>,
+    size: [f64; 2],
+    count: usize,
+    color: ColorCode,
+    description: String,
+    number: String,
+}
+
 /// How a step fills its cell.
 struct Arrangement {
     call_out: CallOut,
@@ -118,7 +129,7 @@ impl Layout<'_> {
         let missing = self.model.missing().len();
         if missing > 0 {
             let are = if missing == 1 { "1 part is".to_owned() } else { format!("{missing} parts are") };
-            let words = format!("Incomplete: {are} missing from the parts library and left out");
+            let words = format!("Incomplete: {are} missing from the parts library");
             page.text([PAGE_MM[0] - 12.0, PAGE_MM[1] - 12.0], 5.0, Weight::Bold, ALARM, Align::Right, words);
         }
         self.pages.push(page);
@@ -127,17 +138,12 @@ impl Layout<'_> {
     fn parts_list(&mut self) {
         const COLUMNS: usize = 6;
         let width = (PAGE_MM[0] - 2.0 * MARGIN) / COLUMNS as f64;
-        let mut totals = self.plan.totals();
-        // Colours together, as parts are sorted by hand; within a colour by what they are.
-        totals.sort_by_key(|((part, color), _)| {
-            (self.model.colors().look(*color).name, natural(&self.model.file(*part).description), *part, *color)
-        });
+        let lines = self.list_lines();
         let (top, bottom) = (24.0, PAGE_MM[1] - FOOT - 4.0);
         let mut page = Page::default();
         let mut y = f64::INFINITY;
-        for row in totals.chunks(COLUMNS) {
-            let pictures = row.iter().map(|((part, color), _)| self.shot(PieceKind::Part(*part, *color)).size_mm());
-            let height = pictures.map(|size| size[1]).fold(0.0, f64::max) + 17.5;
+        for row in lines.chunks(COLUMNS) {
+            let height = row.iter().map(|line| line.size[1]).fold(0.0, f64::max) + 17.5;
             if y + height > bottom {
                 let first = self.pages.len() == 1 && page.elements.is_empty();
                 if !page.elements.is_empty() {
@@ -146,39 +152,86 @@ impl Layout<'_> {
                 page.title = "Parts".to_owned();
                 page.text([MARGIN + 2.0, 17.0], 8.0, Weight::Bold, INK, Align::Left, "Parts");
                 if first {
-                    let count: usize = totals.iter().map(|(_, count)| count).sum();
-                    let sum = format!("{count} in all, {} different", totals.len());
+                    let count: usize = lines.iter().map(|line| line.count).sum();
+                    let sum = format!("{count} in all, {} different", lines.len());
                     page.text([PAGE_MM[0] - MARGIN - 2.0, 17.0], 4.0, Weight::Regular, GREY, Align::Right, sum);
                 }
                 y = top;
             }
-            for (column, ((part, color), count)) in row.iter().enumerate() {
-                let kind = PieceKind::Part(*part, *color);
-                let [w, h] = self.shot(kind).size_mm();
+            for (column, line) in row.iter().enumerate() {
                 let left = MARGIN + column as f64 * width + 2.0;
                 let base = y + height - 17.5;
-                page.picture(Rect::new(left + 0.5 * (width - 4.0 - w), base - h, w, h), PictureId::Piece(kind));
-                page.text([left, base + 4.6], 4.4, Weight::Bold, INK, Align::Left, format!("{count}x"));
-                let look = self.model.colors().look(*color);
+                let [w, h] = line.size;
+                let picture = Rect::new(left + 0.5 * (width - 4.0 - w), base - h, w, h);
+                match line.picture {
+                    Some(id) => page.picture(picture, id),
+                    None => {
+                        let frame = Some((ALARM, 0.3));
+                        page.elements.push(crate::page::Element::Box {
+                            rect: picture,
+                            radius: 1.2,
+                            fill: None,
+                            line: frame,
+                        });
+                        let middle = [picture.x + 0.5 * w, picture.y + 0.5 * h + 2.2];
+                        page.text(middle, 6.0, Weight::Bold, ALARM, Align::Center, "?");
+                    }
+                }
+                page.text([left, base + 4.6], 4.4, Weight::Bold, INK, Align::Left, format!("{}x", line.count));
+                let look = self.model.colors().look(line.color);
                 let swatch = Rect::new(left + 12.0, base + 1.6, 3.2, 3.2);
-                let line = Some((crate::geometry::line_rgb(look.rgb), 0.15));
-                page.elements.push(crate::page::Element::Box { rect: swatch, radius: 0.5, fill: Some(look.rgb), line });
+                let edge = Some((crate::geometry::line_rgb(look.rgb), 0.15));
+                page.elements.push(crate::page::Element::Box {
+                    rect: swatch,
+                    radius: 0.5,
+                    fill: Some(look.rgb),
+                    line: edge,
+                });
                 let name = Weight::Regular.wrapped(&look.name, 2.7, width - 20.5, 1);
                 page.text([left + 16.4, base + 4.2], 2.7, Weight::Regular, INK, Align::Left, name.concat());
-                let file = self.model.file(*part);
-                let mut line = base + 8.2;
-                for text in Weight::Regular.wrapped(&plain(&file.description), 2.5, width - 5.0, 2) {
-                    page.text([left, line], 2.5, Weight::Regular, INK, Align::Left, text);
-                    line += 3.0;
+                let ink = if line.picture.is_some() { INK } else { ALARM };
+                let mut at = base + 8.2;
+                for text in Weight::Regular.wrapped(&line.description, 2.5, width - 5.0, 2) {
+                    page.text([left, at], 2.5, Weight::Regular, ink, Align::Left, text);
+                    at += 3.0;
                 }
-                let number = Weight::Regular.wrapped(&stem(&file.name), 2.3, width - 5.0, 1).concat();
-                page.text([left, line], 2.3, Weight::Regular, GREY, Align::Left, number);
+                let number = Weight::Regular.wrapped(&line.number, 2.3, width - 5.0, 1).concat();
+                page.text([left, at], 2.3, Weight::Regular, GREY, Align::Left, number);
             }
             y += height;
         }
         if !page.elements.is_empty() {
             self.pages.push(page);
         }
+    }
+
+    /// What the parts list names: colours together, as parts are sorted by hand; within a colour by what they are; what is
+    /// missing last.
+    fn list_lines(&self) -> Vec<ListLine> {
+        let mut totals = self.plan.totals();
+        totals.sort_by_key(|((part, color), _)| {
+            (self.model.colors().look(*color).name, natural(&self.model.file(*part).description), *part, *color)
+        });
+        let there = totals.into_iter().map(|((part, color), count)| {
+            let (kind, file) = (PieceKind::Part(part, color), self.model.file(part));
+            ListLine {
+                picture: Some(PictureId::Piece(kind)),
+                size: self.shot(kind).size_mm(),
+                count,
+                color,
+                description: plain(&file.description),
+                number: stem(&file.name),
+            }
+        });
+        let missing = self.plan.missing.iter().map(|(brick, count)| ListLine {
+            picture: None,
+            size: [12.0, 12.0],
+            count: *count,
+            color: brick.color,
+            description: "Missing: in no step".to_owned(),
+            number: stem(&brick.name),
+        });
+        there.chain(missing).collect()
     }
 
     fn shot(&self, kind: PieceKind) -> &Shot {

@@ -1,9 +1,9 @@
 //! What is built when: submodels, their steps, and what each step adds.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fmt::Write as _;
 
-use mb_bricks::{BuildSite, ColorCode, FileId, FileKind, Model, StepView};
+use mb_bricks::{BuildSite, ColorCode, FileId, FileKind, MissingBrick, Model, StepView};
 
 use crate::automatic::{Unit, automatic_steps};
 
@@ -18,6 +18,8 @@ pub struct Plan {
     /// The steps in the order of the booklet: section and step. A submodel comes right before the step that first
     /// needs it.
     pub order: Vec<(usize, usize)>,
+    /// Bricks whose parts are nowhere, and how many of each, sorted: no step adds them, parts lists name them.
+    pub missing: Vec<(MissingBrick, usize)>,
     /// What the reader should know.
     pub warnings: Vec<String>,
 }
@@ -65,7 +67,7 @@ pub enum PieceKind {
 }
 
 impl Plan {
-    /// Plans the building of a model. Parts that are missing from every library are left out, with a warning.
+    /// Plans the building of a model. Parts that are missing from every library are left out of the steps, with a warning.
     pub fn of(model: &Model) -> Self {
         let mut planner = Planner::new(model);
         let root = planner.tree.resolved(0);
@@ -74,10 +76,17 @@ impl Plan {
         }
         let mut warnings = planner.warnings;
         for missing in model.missing() {
-            warnings
-                .push(format!("{} ({} line {}) is missing: it is left out", missing.name, missing.file, missing.line));
+            warnings.push(format!(
+                "{} ({} line {}) is missing: no step adds it, the parts lists name it",
+                missing.name, missing.file, missing.line
+            ));
         }
-        let mut plan = Self { sections: planner.sections, order: planner.order, warnings };
+        let mut missing = BTreeMap::new();
+        for brick in model.missing_bricks() {
+            *missing.entry(brick.clone()).or_default() += 1;
+        }
+        let missing = missing.into_iter().collect();
+        let mut plan = Self { sections: planner.sections, order: planner.order, missing, warnings };
         plan.count_copies();
         plan
     }
@@ -107,7 +116,7 @@ impl Plan {
 
     /// The bricks that the steps add, all copies together, by part and colour, sorted.
     pub fn totals(&self) -> Vec<((FileId, ColorCode), usize)> {
-        let mut counts = std::collections::BTreeMap::new();
+        let mut counts = BTreeMap::new();
         for section in &self.sections {
             for piece in section.steps.iter().flat_map(|step| &step.pieces) {
                 if let PieceKind::Part(part, color) = piece.kind {

@@ -78,6 +78,10 @@ fn models_without_parts_with_missing_parts_and_with_strange_colours_give_booklet
     let (page, summary) = bytes(strange, Form::Html);
     assert!(str::from_utf8(&page).unwrap().contains("Incomplete: 1 part is missing"));
     assert!(
+        str::from_utf8(&page).unwrap().contains("in no step") && str::from_utf8(&page).unwrap().contains("nosuchpart")
+    );
+    assert_eq!((summary.parts, summary.missing_parts), (3, 1));
+    assert!(
         str::from_utf8(&page).unwrap().contains("<title>tower</title>"),
         "the file's name for want of a better one"
     );
@@ -85,6 +89,27 @@ fn models_without_parts_with_missing_parts_and_with_strange_colours_give_booklet
     let model = model(strange);
     let notes = list_notes(&model, &Plan::of(&model));
     assert_eq!(notes.unmapped_colors, ["0x2FF8800 #FF8800", "16 Uncoloured", "9999 Unknown 9999"]);
+    assert_eq!(notes.missing_parts, ["nosuchpart.dat"]);
+}
+
+#[test]
+fn missing_parts_stand_in_the_lists_as_often_as_they_are_used() {
+    // Two uses of a submodel that lacks a part in the colour of its use, and one more in red.
+    let text = "0 FILE main.ldr\n1 4 0 0 0 1 0 0 0 1 0 0 0 1 3001.dat\n1 1 0 -24 0 1 0 0 0 1 0 0 0 1 sub.ldr\n\
+                1 1 0 -72 0 1 0 0 0 1 0 0 0 1 sub.ldr\n1 4 80 0 0 1 0 0 0 1 0 0 0 1 4242424.dat\n\
+                0 FILE sub.ldr\n1 16 0 0 0 1 0 0 0 1 0 0 0 1 3001.dat\n1 16 0 -24 0 1 0 0 0 1 0 0 0 1 4242424.dat\n";
+    let model = model(text);
+    let plan = Plan::of(&model);
+    let csv = shopping_list(&model, &plan);
+    let of_missing: Vec<&str> = csv.lines().filter(|line| line.contains("4242424.dat")).collect();
+    let note = "missing from the parts library: not in the steps";
+    assert_eq!(
+        of_missing,
+        [format!("2,4242424.dat,,1,Blue,4242424,7,{note}"), format!("1,4242424.dat,,4,Red,4242424,5,{note}")]
+    );
+    let xml = wanted_list(&model, &plan);
+    assert!(xml.contains("<ITEMID>4242424</ITEMID>\n    <COLOR>7</COLOR>\n    <MINQTY>2</MINQTY>"), "{xml}");
+    assert_eq!(xml.matches(note).count(), 2);
 }
 
 #[test]

@@ -311,9 +311,16 @@ impl Instructions {
         Form::of(&self.out)?;
         let outputs: Vec<&PathBuf> =
             [Some(&self.out), self.shopping_list.as_ref(), self.wanted_list.as_ref()].into_iter().flatten().collect();
-        if let Some(twice) = (1..outputs.len()).find(|&i| outputs[..i].contains(&outputs[i])) {
-            return Err(InputError::new(outputs[twice], "two outputs have this name")
+        // One file may be written in several ways.
+        let places: Vec<PathBuf> = outputs.iter().map(|path| place(path)).collect();
+        if let Some(twice) = (1..places.len()).find(|&i| places[..i].contains(&places[i])) {
+            return Err(InputError::new(outputs[twice], "two outputs are this file")
                 .help("Give the booklet and each list a file of its own")
+                .into());
+        }
+        if let Some(own) = places.iter().position(|path| *path == place(&self.model.model)) {
+            return Err(InputError::new(outputs[own], "this output is the model itself")
+                .help("Give it another name: the model would be overwritten")
                 .into());
         }
         let model = self.model.read()?;
@@ -347,12 +354,54 @@ impl Instructions {
             for color in &notes.unmapped_colors {
                 text += &format!("no BrickLink colour is known for {color}\n");
             }
+            if !notes.missing_parts.is_empty() {
+                text += &format!("listed, but in no step: {}\n", notes.missing_parts.join(", "));
+            }
             if !notes.uncertain_parts.is_empty() {
                 text += &format!("look up at BrickLink: {}\n", notes.uncertain_parts.join(", "));
             }
             document["unmapped_colors"] = json!(notes.unmapped_colors);
             document["uncertain_parts"] = json!(notes.uncertain_parts);
+            document["missing_part_names"] = json!(notes.missing_parts);
         }
         Outcome::new(&document, text)
+    }
+}
+
+/// Where a path leads, whatever its spelling; the file need not be there yet.
+fn place(path: &Path) -> PathBuf {
+    let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    // The deepest folder that is there decides about links and `..`; what is missing below it has none.
+    let known = absolute.ancestors().find_map(|folder| Some((folder, folder.canonicalize().ok()?)));
+    let Some((folder, canonical)) = known else { return absolute };
+    let rest = absolute.strip_prefix(folder).unwrap_or(Path::new(""));
+    rest.components().fold(canonical, |mut place, part| {
+        match part {
+            std::path::Component::ParentDir => drop(place.pop()),
+            part => place.push(part),
+        }
+        place
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_is_one_place_however_it_is_spelled() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path();
+        std::fs::create_dir(root.join("sub")).unwrap();
+        let same = |a: &str, b: &str| place(&root.join(a)) == place(&root.join(b));
+        assert!(same("a.pdf", "./a.pdf") && same("a.pdf", "sub/../a.pdf") && same("new/a.pdf", "new/b/../a.pdf"));
+        assert!(!same("a.pdf", "sub/a.pdf") && !same("a.pdf", "b.pdf"));
+        std::fs::write(root.join("a.pdf"), "x").unwrap();
+        assert!(same("a.pdf", "sub/../a.pdf"));
+        #[cfg(unix)]
+        {
+            std::os::unix::fs::symlink(root.join("sub"), root.join("link")).unwrap();
+            assert!(same("link/b.pdf", "sub/b.pdf"));
+        }
     }
 }
