@@ -176,8 +176,8 @@ fn bounds(primitives: &[Primitive]) -> Box3 {
 /// Reorders `primitives` into two halves and returns where the second begins; `None` where one leaf is cheaper.
 fn split(primitives: &mut [Primitive], all: &Box3, depth: usize) -> Option<usize> {
     match primitives.len() {
-        0..=MIN_LEAF => None,
-        0..=FEW => split_by_bins::<FEW_BINS>(primitives, all, depth),
+        count if count <= MIN_LEAF => None,
+        count if count <= FEW => split_by_bins::<FEW_BINS>(primitives, all, depth),
         _ => split_by_bins::<BINS>(primitives, all, depth),
     }
 }
