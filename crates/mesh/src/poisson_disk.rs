@@ -36,7 +36,7 @@ pub fn sample_poisson_disk(mesh: &TriangleMesh, n: usize, seed: u64) -> Vec<Poin
 fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64>> {
     let ratio = n as f64 / candidates.len() as f64;
     let floor = BETA * (1.0 - ratio.powf(GAMMA));
-    let (order, mut grid) = Grid::new(candidates, reach);
+    let (mut order, mut grid) = Grid::new(candidates, reach);
     let count = order.len();
     let weights: Vec<f64> = (0..count)
         .into_par_iter()
@@ -64,6 +64,7 @@ fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64
             break;
         }
         surplus -= removed;
+        grid.compact(&mut order);
     }
     let mut queue = Queue::new(&grid.points);
     for _ in 0..surplus {
@@ -264,6 +265,28 @@ impl Grid {
         let points =
             order.iter().map(|&i| Candidate { at: in_reaches(&points[i as usize]).into(), weight: 0.0 }).collect();
         (order, Self { points, cell_of_point, runs })
+    }
+
+    /// Forgets the points that were removed, in `order` too: what is left is near in memory again.
+    fn compact(&mut self, order: &mut Vec<u32>) {
+        let mut kept_before = Vec::with_capacity(self.points.len() + 1);
+        kept_before.push(0);
+        let mut kept = 0;
+        for i in 0..self.points.len() {
+            if !self.points[i].is_removed() {
+                self.points[kept] = self.points[i];
+                self.cell_of_point[kept] = self.cell_of_point[i];
+                order[kept] = order[i];
+                kept += 1;
+            }
+            kept_before.push(kept as u32);
+        }
+        self.points.truncate(kept);
+        self.cell_of_point.truncate(kept);
+        order.truncate(kept);
+        for (first, end) in self.runs.as_flattened_mut() {
+            (*first, *end) = (kept_before[*first as usize], kept_before[*end as usize]);
+        }
     }
 
     /// Takes a point away; those around it are less crowded.
