@@ -4,6 +4,7 @@
 //! Each stage reads and writes documented files, so any of them can be rerun or replaced alone; this crate only
 //! puts them in order.
 
+mod board_sequences;
 mod board_study;
 mod capture_check;
 mod contact_sheet;
@@ -16,6 +17,7 @@ mod pictures;
 mod report;
 mod scene_report;
 
+pub use board_sequences::{BoardSequences, simulate_board_sequences};
 pub use board_study::{BoardStudy, BoardStudyOptions, StudiedPoses, StudiedSequence, board_study};
 pub use capture_check::{
     CaptureCheck, CaptureCheckOptions, EpipolarCheck, EpipolarOptions, EpipolarPair, check_capture, check_report,

@@ -196,7 +196,7 @@ impl Simulate {
     }
 }
 
-fn parse_size(text: &str) -> Result<ImageSize, String> {
+pub(super) fn parse_size(text: &str) -> Result<ImageSize, String> {
     let sides = text.split_once(['x', 'X']).and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let (width, height) = sides.ok_or("must look like 1920x1440")?;
     Ok(ImageSize::new(width, height))

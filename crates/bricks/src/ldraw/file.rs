@@ -150,7 +150,7 @@ pub struct StudSite {
 pub struct LdrawFile {
     /// Its name, as [`normalized_name`] writes it.
     pub name: String,
-    /// The first comment line: what it is, for people.
+    /// The first comment line: what it is, for people. That of a part that moved is the new part's.
     pub description: String,
     /// What it is, for us.
     pub kind: FileKind,

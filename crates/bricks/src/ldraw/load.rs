@@ -192,6 +192,7 @@ impl<'a> Gathering<'a> {
         let order = children_first(&self.files)?;
         check_size(&self.files, &order)?;
         self.say_what_is_odd(&reachable);
+        self.describe_moved_parts(&order);
         let Self { files, colors, warnings, .. } = self;
         Ok(Loaded { files, reachable, colors, missing, warnings: warnings.finish() })
     }
@@ -214,6 +215,18 @@ impl<'a> Gathering<'a> {
             }
         }
         Ok(())
+    }
+
+    /// A part that moved is called what it is, not where it went. `order` has children first, so chains of moves resolve.
+    fn describe_moved_parts(&mut self, order: &[FileId]) {
+        for &id in order {
+            let file = &self.files[id.index()];
+            if file.moved_to.is_some()
+                && let Some(target) = file.references.iter().find_map(|reference| reference.target)
+            {
+                self.files[id.index()].description = self.files[target.index()].description.clone();
+            }
+        }
     }
 
     fn say_what_is_odd(&mut self, reachable: &[FileId]) {

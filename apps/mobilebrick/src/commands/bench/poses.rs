@@ -3,11 +3,13 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use mb_geometry::ImageSize;
 use mb_job::Result;
-use mb_pipeline::{BoardStudyOptions, StudiedPoses, board_study};
+use mb_pipeline::{BoardSequences, BoardStudyOptions, StudiedPoses, board_study, simulate_board_sequences};
 
 use crate::commands::Seed;
 use crate::commands::board::BoardArgument;
+use crate::commands::capture::parse_size;
 use crate::outcome::Outcome;
 use crate::terminal::Terminal;
 
@@ -18,13 +20,25 @@ use crate::terminal::Terminal;
 #[derive(Debug, Args)]
 pub struct Poses {
     /// Sequences that show the board, with model and clicked points
-    #[arg(value_name = "SEQ", required = true)]
+    #[arg(value_name = "SEQ", required_unless_present = "simulate")]
     sequences: Vec<PathBuf>,
+
+    /// Sequences to simulate besides: random models standing on the printed board
+    #[arg(long, value_name = "N")]
+    simulate: Option<usize>,
+
+    /// Photographs of each simulated sequence
+    #[arg(long, value_name = "N", default_value_t = 24)]
+    frames: usize,
+
+    /// Size of the simulated photographs
+    #[arg(long, value_name = "WxH", default_value = "960x720", value_parser = parse_size)]
+    size: ImageSize,
 
     #[command(flatten)]
     board: BoardArgument,
 
-    /// Folder for the results: poses.json, poses.md and a file for each sequence
+    /// Folder for the results: poses.json, poses.md, a file for each sequence, and sequences/ with the simulated ones
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
 
@@ -36,7 +50,13 @@ impl Poses {
     /// Runs the subcommand.
     pub fn run(self, terminal: &Terminal) -> Result<Outcome> {
         let options = BoardStudyOptions { seed: self.seed.seed, ..BoardStudyOptions::default() };
-        let study = board_study(&self.sequences, &self.board.parse()?, &options, &self.output, terminal)?;
+        let board = self.board.parse()?;
+        let mut sequences = self.sequences;
+        if let Some(count) = self.simulate {
+            let plan = BoardSequences { count, frames: self.frames, size: self.size, seed: self.seed.seed };
+            sequences.extend(simulate_board_sequences(&board, &plan, &self.output.join("sequences"), terminal)?);
+        }
+        let study = board_study(&sequences, &board, &options, &self.output, terminal)?;
         let mut text = format!(
             "{} sequences, {} simulated; relative poses over all pairs, shares of the reconstruction within {} mm\n",
             study.sequences.len(),
