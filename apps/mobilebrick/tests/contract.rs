@@ -96,6 +96,13 @@ fn the_stages_run_by_hand_on_the_built_in_model() {
     let sequence = dir.path().join("seq");
     let seq = text(&sequence);
 
+    let list = document(&["model", "parts", "list"]);
+    assert!(list["built_in"].as_array().unwrap().iter().any(|brick| brick["part"] == "3001"));
+    let brick = dir.path().join("brick.ldr");
+    std::fs::write(&brick, "0 A brick\n1 4 0 0 0 1 0 0 0 1 0 0 0 1 3001.dat\n").unwrap();
+    let built_in = document(&["model", "info", text(&brick), "--parts", "built-in"]);
+    assert_eq!((built_in["parts"].as_u64(), built_in["missing"].as_array().unwrap().len()), (Some(1), 0));
+
     let info = document(&["model", "info", "demo"]);
     has_keys(&info, &["parts", "distinct_parts", "triangles", "steps", "mirrored_parts", "bbox_ldu", "bbox_mm"]);
     has_keys(&info, &["missing", "bom", "warnings"]);

@@ -12,7 +12,7 @@ use mb_job::{Error, InputError, Result};
 use serde_json::json;
 
 use super::Seed;
-use super::parts::{Parts, PartsArgument};
+use super::parts::{NO_LIBRARY, Parts, PartsArgument};
 use crate::outcome::Outcome;
 use crate::terminal::Terminal;
 
@@ -95,6 +95,9 @@ impl Info {
         );
         for missing in &info.missing {
             text += &format!("missing: {} ({} line {})\n", missing.name, missing.file, missing.line);
+        }
+        if !info.missing.is_empty() && !self.model.parts.has_library() {
+            text += &format!("{NO_LIBRARY}\n");
         }
         for line in &info.bom {
             text += &format!("{:>5} x {:<16} {:<28} {}\n", line.count, line.part, line.color_name, line.description);

@@ -12,12 +12,24 @@ use crate::outcome::Outcome;
 /// The library to resolve parts in.
 #[derive(Debug, Args)]
 pub struct PartsArgument {
-    /// Parts library: an LDraw folder or its zip. Default: $LDRAWDIR, then the installed one, then built-in bricks
+    /// Parts library: an LDraw folder or its zip, or `built-in` for no library. Default: $LDRAWDIR, then the installed
+    /// one, then built-in bricks
     #[arg(long, value_name = "PATH")]
     parts: Option<PathBuf>,
 }
 
+/// What `--parts` says where the bricks that need no library are wanted, whatever library there is.
+const BUILT_IN: &str = "built-in";
+/// What to do where no library is used.
+pub(super) const NO_LIBRARY: &str = "no library: built-in bricks only (`model parts list` names them). Give one with --parts, LDRAWDIR or \
+                                     `model parts install`";
+
 impl PartsArgument {
+    /// Whether there is a library to open.
+    pub fn has_library(&self) -> bool {
+        locate(self.parts.as_deref()).is_some()
+    }
+
     /// Opens the library, or `None` where there is none and built-in bricks must do.
     pub fn open(&self) -> Result<Option<PartLibrary>> {
         locate(self.parts.as_deref()).map(|(path, _)| PartLibrary::open(path)).transpose()
@@ -27,7 +39,7 @@ impl PartsArgument {
 /// The library's path and which rule found it.
 fn locate(given: Option<&Path>) -> Option<(PathBuf, &'static str)> {
     if let Some(path) = given {
-        return Some((path.to_owned(), "--parts"));
+        return (path != Path::new(BUILT_IN)).then(|| (path.to_owned(), "--parts"));
     }
     if let Some(path) = std::env::var_os("LDRAWDIR").filter(|v| !v.is_empty()) {
         return Some((path.into(), "LDRAWDIR"));
@@ -58,6 +70,8 @@ pub enum Parts {
     Verify(PartsArgument),
     /// Say which library is used, and why
     Where(PartsArgument),
+    /// The bricks that are drawn without a library
+    List,
 }
 
 impl Parts {
@@ -67,6 +81,7 @@ impl Parts {
             Self::Install { source } => install(&source),
             Self::Verify(argument) => verify(argument.parts.as_deref()),
             Self::Where(argument) => where_is(argument.parts.as_deref()),
+            Self::List => list(),
         }
     }
 }
@@ -98,8 +113,15 @@ fn where_is(given: Option<&Path>) -> Result<Outcome> {
     let found = locate(given);
     let text = match &found {
         Some((path, rule)) => format!("{} ({rule})", path.display()),
-        None => "no library: built-in bricks only. Give one with --parts, LDRAWDIR or `model parts install`".to_owned(),
+        None => NO_LIBRARY.to_owned(),
     };
     let (path, rule) = found.unzip();
     Outcome::new(&json!({ "path": path, "found_by": rule }), text)
+}
+
+fn list() -> Result<Outcome> {
+    let bricks: Vec<_> = mb_bricks::drawable_parts().collect();
+    let text: String = bricks.iter().map(|(number, title)| format!("{number:<8} {title}\n")).collect();
+    let bricks: Vec<_> = bricks.iter().map(|(part, title)| json!({ "part": part, "description": title })).collect();
+    Outcome::new(&json!({ "built_in": bricks }), text)
 }
