@@ -60,6 +60,12 @@ impl Quality {
         }
     }
 
+    /// Whether the flats of the surroundings are shaded once a pixel, in its middle, for all samples that see them: textures
+    /// are filtered to the pixel already. The samples of bricks, whose edges and highlights are finer, are always their own.
+    fn shades_flats_once(self) -> bool {
+        self == Self::Draft
+    }
+
     /// The least share of light mirrored by a coat for which a ray is followed.
     fn mirrors_from(self) -> f32 {
         match self {
@@ -92,22 +98,38 @@ pub(crate) fn expose(shot: &Shot<'_>, object_from_cam: impl Fn(f64) -> Rigid3<Ob
     let longer = shot.size.width.max(shot.size.height);
     let probes = Probes::new(shot.stage, &middle, shot.quality.tracing(longer), shot.salt);
     let samples = shot.quality.samples();
-    let mut sum = Image::filled(shot.size, Vec3::ZERO);
-    let mut depth = None;
-    for (i, (dx, dy)) in samples.iter().enumerate() {
-        let at_s = ((i as f64 + 0.5) / samples.len() as f64 - 0.5) * EXPOSURE_S;
+    let eye_at = |at_s: f64, (dx, dy): (f64, f64)| {
         let k = shot.intrinsics;
         let shifted = Intrinsics { cx: k.cx - dx, cy: k.cy - dy, ..k };
-        let eye = Eye::new(shot.size, shifted, shot.distortion, shot.readout_s, |row_s| object_from_cam(at_s + row_s));
+        Eye::new(shot.size, shifted, shot.distortion, shot.readout_s, |row_s| object_from_cam(at_s + row_s))
+    };
+    let centred = shot.quality.shades_flats_once().then(|| eye_at(0.0, (0.0, 0.0)));
+    let mut sum = Image::filled(shot.size, Vec3::ZERO);
+    let mut depth = None;
+    // Triangles of the first pass, and what they added to the sum.
+    let mut first: Option<(Image<u32>, Image<Vec3>)> = None;
+    for (i, offset) in samples.iter().enumerate() {
+        let at_s = ((i as f64 + 0.5) / samples.len() as f64 - 0.5) * EXPOSURE_S;
+        let eye = eye_at(at_s, *offset);
         let raster = eye.look(shot.stage);
-        let pass = Pass { shot, raster: &raster, eye: &eye, probes: &probes, salt: hash(i as i32, 77, shot.salt) };
+        let salt = hash(i as i32, 77, shot.salt);
+        let pass = Pass { shot, raster: &raster, eye: &eye, flats: centred.as_ref(), probes: &probes, salt };
         let width = shot.size.width;
         sum.data_mut().par_chunks_mut(width).enumerate().for_each(|(y, row)| {
             for (x, pixel) in row.iter_mut().enumerate() {
-                *pixel += pass.radiance(x, y) / samples.len() as f32;
+                let triangle = raster.triangle[(x, y)];
+                *pixel += match &first {
+                    Some((known, added)) if known[(x, y)] == triangle && !shot.stage.is_model(triangle) => {
+                        added[(x, y)]
+                    }
+                    _ => pass.radiance(x, y) / samples.len() as f32,
+                };
             }
         });
-        depth.get_or_insert(raster.depth);
+        if i == 0 {
+            depth = Some(raster.depth);
+            first = centred.is_some().then(|| (raster.triangle, sum.clone()));
+        }
     }
     let scale = longer as f32 / 1920.0;
     match depth {
@@ -153,6 +175,8 @@ struct Pass<'a> {
     shot: &'a Shot<'a>,
     raster: &'a Raster,
     eye: &'a Eye,
+    /// How flats of the surroundings are seen, where that is another way.
+    flats: Option<&'a Eye>,
     probes: &'a Probes<'a>,
     salt: u32,
 }
@@ -160,17 +184,27 @@ struct Pass<'a> {
 impl Pass<'_> {
     fn radiance(&self, x: usize, y: usize) -> Vec3 {
         let stage = self.shot.stage;
-        let direction = self.eye.direction(x, y);
         let triangle = self.raster.triangle[(x, y)];
         if triangle == NO_TRIANGLE {
-            let d = direction.normalize();
+            let d = self.flats.unwrap_or(self.eye).direction(x, y).normalize();
             return stage.light.room(d, 0.01) + stage.light.panes(d, 0.005);
         }
-        let z = self.raster.depth[(x, y)];
-        let place = self.eye.place(x, y) + direction * z;
+        let mut direction = self.eye.direction(x, y);
+        let mut z = self.raster.depth[(x, y)];
+        let mut place = self.eye.place(x, y) + direction * z;
+        let mut normal = stage.normal(triangle, place, -direction.normalize());
+        if let Some(flats) = self.flats.filter(|_| !stage.is_model(triangle)) {
+            // Where the pixel's middle meets the same plane.
+            let (from, along) = (flats.place(x, y), flats.direction(x, y));
+            let met = (place - from).dot(normal) / along.dot(normal);
+            if met > 0.0 && met.is_finite() {
+                (direction, z, place) = (along, met, from + along * met);
+                normal = stage.normal(triangle, place, -direction.normalize());
+            }
+        }
         let view = -direction.normalize();
         let surface = stage.surface(triangle, place, view, z / self.eye.focal_px());
-        let arriving = self.probes.at(place, stage.normal(triangle, place, view));
+        let arriving = self.probes.at(place, normal);
         let noise = hash(x as i32, y as i32, self.salt);
         shade(stage, &surface, place, view, arriving, self.shot.quality.mirrors_from(), noise)
     }

@@ -25,9 +25,15 @@ pub(crate) fn unit(h: u32) -> f32 {
     (h >> 8) as f32 / 16_777_216.0
 }
 
+/// The largest whole number not above `x`, for `x` within 2^31; the library's is a call on older processors.
+fn floor(x: f32) -> f32 {
+    let cut = x as i32 as f32;
+    if cut > x { cut - 1.0 } else { cut }
+}
+
 /// Value noise over the plane, in [0, 1), with features of unit size.
 pub(crate) fn noise(x: f32, y: f32, salt: u32) -> f32 {
-    let (x0, y0) = (x.floor(), y.floor());
+    let (x0, y0) = (floor(x), floor(y));
     let (u, v) = (x - x0, y - y0);
     let (u, v) = (u * u * (3.0 - 2.0 * u), v * v * (3.0 - 2.0 * v));
     let (i, j) = (x0 as i32, y0 as i32);
@@ -39,7 +45,7 @@ pub(crate) fn noise(x: f32, y: f32, salt: u32) -> f32 {
 
 /// Value noise in space, in [-1, 1), with features of unit size.
 pub(crate) fn noise3(p: Vec3, salt: u32) -> f32 {
-    let layer = p.z.floor();
+    let layer = floor(p.z);
     let w = p.z - layer;
     let w = w * w * (3.0 - 2.0 * w);
     let salted = |l: f32| salt ^ (l as i32 as u32).wrapping_mul(0x27D4_EB2F);

@@ -242,6 +242,11 @@ impl Stage {
         })
     }
 
+    /// Whether a triangle is the model's; the others are flats of the surroundings.
+    pub fn is_model(&self, triangle: u32) -> bool {
+        (triangle as usize) < self.model_triangles
+    }
+
     /// The normal at `p` on `triangle`, without relief, turned towards `view` (unit, from the surface).
     pub fn normal(&self, triangle: u32, p: Vec3, view: Vec3) -> Vec3 {
         let t = triangle as usize;
