@@ -175,7 +175,7 @@ fn read_pair(pair: &Pair, options: &DepthOptions) -> Result<(MetricDepth, Metric
     let (gt, pred) = (metres(&pair.gt)?, metres(&pair.pred)?);
     if gt.size() != pred.size() {
         let found = format!("{} pixels, but the ground truth {} is {}", pred.size(), pair.gt.display(), gt.size());
-        let help = "Bring the prediction to the ground truth's size first, for instance with `mobilebrick upsample`";
+        let help = "Bring the prediction to the ground truth's size first, such as by taking the nearest pixel";
         return Err(InputError::new(&pair.pred, found).help(help).into());
     }
     let confidence = match &options.confidence {
