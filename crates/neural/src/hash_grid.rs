@@ -18,6 +18,8 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::simd::dispatched;
+
 /// Sizes of the encoding.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -66,42 +68,103 @@ pub struct Scatter<'a> {
     pub first: usize,
 }
 
-/// The eight corners of a cell: table index, and where it lies between them.
+/// The eight corners of a cell: table index, and where it lies between them. Corner c is the far one along dimension d
+/// where bit d of c is set.
+#[derive(Clone, Copy)]
 struct Cell {
     corners: [u32; 8],
     t: [f32; 3],
 }
 
 impl Cell {
+    const ZERO: Self = Self { corners: [0; 8], t: [0.0; 3] };
+
+    /// Along dimension d, for each corner: the weight, and its derivative (-1 or 1).
     #[inline(always)]
-    fn weight(&self, corner: usize) -> f32 {
-        let pick = |d: usize| if corner >> d & 1 == 1 { self.t[d] } else { 1.0 - self.t[d] };
-        pick(0) * pick(1) * pick(2)
+    fn along(&self, d: usize) -> ([f32; 8], [f32; 8]) {
+        let far = |c: usize| c >> d & 1 == 1;
+        (
+            std::array::from_fn(|c| if far(c) { self.t[d] } else { 1.0 - self.t[d] }),
+            std::array::from_fn(|c| if far(c) { 1.0 } else { -1.0 }),
+        )
     }
 
-    /// `sum_d dw/dt_d v_d`.
+    /// `w_c`.
     #[inline(always)]
-    fn weight_tangent(&self, corner: usize, v: [f32; 3]) -> f32 {
-        let [dx, dy, dz] = self.weight_gradient(corner);
-        dx * v[0] + dy * v[1] + dz * v[2]
+    fn weights(&self) -> [f32; 8] {
+        let ((x, _), (y, _), (z, _)) = (self.along(0), self.along(1), self.along(2));
+        std::array::from_fn(|c| x[c] * y[c] * z[c])
     }
 
-    /// `sum_d v_d d/dt_k dw/dt_d` for each k; trilinear weights have no pure second derivatives.
+    /// `dw_c/dt_d` for each d.
     #[inline(always)]
-    fn weight_second(&self, corner: usize, v: [f32; 3]) -> [f32; 3] {
-        let pick = |d: usize| if corner >> d & 1 == 1 { self.t[d] } else { 1.0 - self.t[d] };
-        let sign = |d: usize| if corner >> d & 1 == 1 { 1.0 } else { -1.0 };
-        let (xy, xz, yz) = (sign(0) * sign(1) * pick(2), sign(0) * sign(2) * pick(1), sign(1) * sign(2) * pick(0));
-        [xy * v[1] + xz * v[2], xy * v[0] + yz * v[2], xz * v[0] + yz * v[1]]
+    fn weight_gradients(&self) -> [[f32; 8]; 3] {
+        let ((x, dx), (y, dy), (z, dz)) = (self.along(0), self.along(1), self.along(2));
+        [
+            std::array::from_fn(|c| dx[c] * y[c] * z[c]),
+            std::array::from_fn(|c| x[c] * dy[c] * z[c]),
+            std::array::from_fn(|c| x[c] * y[c] * dz[c]),
+        ]
     }
 
+    /// `scale sum_d dw_c/dt_d v_d`.
     #[inline(always)]
-    fn weight_gradient(&self, corner: usize) -> [f32; 3] {
-        let pick = |d: usize| if corner >> d & 1 == 1 { self.t[d] } else { 1.0 - self.t[d] };
-        let sign = |d: usize| if corner >> d & 1 == 1 { 1.0 } else { -1.0 };
-        let (x, y, z) = (pick(0), pick(1), pick(2));
-        [sign(0) * y * z, sign(1) * x * z, sign(2) * x * y]
+    fn weight_tangents(&self, v: [f32; 3], scale: f32) -> [f32; 8] {
+        let [dx, dy, dz] = self.weight_gradients();
+        std::array::from_fn(|c| scale * (dx[c] * v[0] + dy[c] * v[1] + dz[c] * v[2]))
     }
+
+    /// `sum_d v_d d/dt_k dw_c/dt_d` for each k; trilinear weights have no pure second derivatives.
+    #[inline(always)]
+    fn weight_seconds(&self, v: [f32; 3]) -> [[f32; 8]; 3] {
+        let ((x, dx), (y, dy), (z, dz)) = (self.along(0), self.along(1), self.along(2));
+        [
+            std::array::from_fn(|c| dx[c] * (dy[c] * z[c] * v[1] + y[c] * dz[c] * v[2])),
+            std::array::from_fn(|c| dy[c] * (dx[c] * z[c] * v[0] + x[c] * dz[c] * v[2])),
+            std::array::from_fn(|c| dz[c] * (dx[c] * y[c] * v[0] + x[c] * dy[c] * v[1])),
+        ]
+    }
+
+    /// `sum_c factor_c theta_c`.
+    #[inline(always)]
+    fn blend<const F: usize>(&self, table: &[f32], factors: &[f32; 8]) -> [f32; F] {
+        let mut sum = [0.0; F];
+        for c in 0..8 {
+            let theta = entry::<F>(table, self.corners[c]);
+            for f in 0..F {
+                sum[f] += factors[c] * theta[f];
+            }
+        }
+        sum
+    }
+
+    /// `g . theta_c`.
+    #[inline(always)]
+    fn dots<const F: usize>(&self, table: &[f32], g: &[f32]) -> [f32; 8] {
+        let mut dots = [0.0; 8];
+        for c in 0..8 {
+            let theta = entry::<F>(table, self.corners[c]);
+            for f in 0..F {
+                dots[c] += g[f] * theta[f];
+            }
+        }
+        dots
+    }
+}
+
+#[inline(always)]
+fn dot8(a: &[f32; 8], b: &[f32; 8]) -> f32 {
+    let mut sum = 0.0;
+    for c in 0..8 {
+        sum += a[c] * b[c];
+    }
+    sum
+}
+
+#[inline(always)]
+fn entry<const F: usize>(table: &[f32], corner: u32) -> &[f32; F] {
+    let at = corner as usize * F;
+    table[at..at + F].try_into().expect("the slice has this length")
 }
 
 impl Level {
@@ -131,24 +194,186 @@ impl Level {
     }
 }
 
-/// Runs `$body` with the constant `F` equal to the number of features.
+/// Calls a kernel with the constant `F` equal to the number of features.
 macro_rules! with_features {
-    ($self:ident, $function:ident ( $($arg:expr),* )) => {
-        match $self.options.features {
-            1 => $self.$function::<1>($($arg),*),
-            2 => $self.$function::<2>($($arg),*),
-            4 => $self.$function::<4>($($arg),*),
-            _ => $self.$function::<8>($($arg),*),
+    ($features:expr, $kernel:ident ( $($arg:expr),* $(,)? )) => {
+        match $features {
+            1 => $kernel::<1>($($arg),*),
+            2 => $kernel::<2>($($arg),*),
+            4 => $kernel::<4>($($arg),*),
+            _ => $kernel::<8>($($arg),*),
         }
     };
 }
 
+/// The columns of a level in rows of all levels' features.
+#[derive(Debug, Clone, Copy)]
+struct Columns {
+    stride: usize,
+    first: usize,
+}
+
+impl Columns {
+    #[inline(always)]
+    fn of<'a, const F: usize>(&self, rows: &'a [f32], row: usize) -> &'a [f32] {
+        &rows[row * self.stride + self.first..][..F]
+    }
+
+    #[inline(always)]
+    fn of_mut<'a, const F: usize>(&self, rows: &'a mut [f32], row: usize) -> &'a mut [f32] {
+        &mut rows[row * self.stride + self.first..][..F]
+    }
+}
+
+/// Positions whose cells are found before any of their corners is read: the reads, which are slow, then overlap.
+const AHEAD: usize = 16;
+
+/// The cells of up to [`AHEAD`] positions.
 #[inline(always)]
-fn entry<const F: usize>(table: &[f32], level: &Level, corner: u32) -> [f32; F] {
-    let at = level.offset + corner as usize * F;
-    let mut out = [0.0; F];
-    out.copy_from_slice(&table[at..at + F]);
-    out
+fn cells_of(level: &Level, positions: &[[f32; 3]]) -> [Cell; AHEAD] {
+    let mut cells = [Cell::ZERO; AHEAD];
+    for (cell, p) in cells.iter_mut().zip(positions) {
+        *cell = level.cell(*p);
+    }
+    cells
+}
+
+// Each kernel works on one level for all positions, so that its part of the table stays in the cache.
+
+#[inline(always)]
+fn encode_level_body<const F: usize>(
+    level: Level,
+    table: &[f32],
+    positions: &[[f32; 3]],
+    out: &mut [f32],
+    at: Columns,
+) {
+    for (block, block_positions) in positions.chunks(AHEAD).enumerate() {
+        let cells = cells_of(&level, block_positions);
+        for (j, cell) in cells.iter().enumerate().take(block_positions.len()) {
+            let i = block * AHEAD + j;
+            at.of_mut::<F>(out, i).copy_from_slice(&cell.blend::<F>(table, &cell.weights()));
+        }
+    }
+}
+dispatched! {
+    fn encode_level<const F: usize>(level: Level, table: &[f32], positions: &[[f32; 3]], out: &mut [f32], at: Columns)
+    = encode_level_body
+}
+
+#[inline(always)]
+fn tangent_level_body<const F: usize>(
+    level: Level,
+    table: &[f32],
+    positions: &[[f32; 3]],
+    d_n: &[[f32; 3]],
+    out: &mut [f32],
+    at: Columns,
+) {
+    let scale = level.cells as f32;
+    for (block, block_positions) in positions.chunks(AHEAD).enumerate() {
+        let cells = cells_of(&level, block_positions);
+        for (j, cell) in cells.iter().enumerate().take(block_positions.len()) {
+            let i = block * AHEAD + j;
+            let factors = cell.weight_tangents(d_n[i], scale);
+            at.of_mut::<F>(out, i).copy_from_slice(&cell.blend::<F>(table, &factors));
+        }
+    }
+}
+dispatched! {
+    fn tangent_level<const F: usize>(level: Level, table: &[f32], positions: &[[f32; 3]], d_n: &[[f32; 3]],
+                                     out: &mut [f32], at: Columns) = tangent_level_body
+}
+
+#[inline(always)]
+fn gradient_level_body<const F: usize>(
+    level: Level,
+    table: &[f32],
+    positions: &[[f32; 3]],
+    g: &[f32],
+    normals: &mut [[f32; 3]],
+    at: Columns,
+) {
+    let scale = level.cells as f32;
+    for (block, block_positions) in positions.chunks(AHEAD).enumerate() {
+        let cells = cells_of(&level, block_positions);
+        for (j, cell) in cells.iter().enumerate().take(block_positions.len()) {
+            let i = block * AHEAD + j;
+            let dots = cell.dots::<F>(table, at.of::<F>(g, i));
+            let gradients = cell.weight_gradients();
+            for d in 0..3 {
+                normals[i][d] += scale * dot8(&gradients[d], &dots);
+            }
+        }
+    }
+}
+dispatched! {
+    fn gradient_level<const F: usize>(level: Level, table: &[f32], positions: &[[f32; 3]], g: &[f32],
+                                      normals: &mut [[f32; 3]], at: Columns) = gradient_level_body
+}
+
+#[inline(always)]
+fn second_level_body<const F: usize>(
+    level: Level,
+    table: &[f32],
+    positions: &[[f32; 3]],
+    g: &[f32],
+    d_n: &[[f32; 3]],
+    to: &mut [[f32; 3]],
+    at: Columns,
+) {
+    let scale = (level.cells as f32) * (level.cells as f32);
+    for (block, block_positions) in positions.chunks(AHEAD).enumerate() {
+        let cells = cells_of(&level, block_positions);
+        for (j, cell) in cells.iter().enumerate().take(block_positions.len()) {
+            let i = block * AHEAD + j;
+            let dots = cell.dots::<F>(table, at.of::<F>(g, i));
+            let seconds = cell.weight_seconds(d_n[i]);
+            for d in 0..3 {
+                to[i][d] += scale * dot8(&seconds[d], &dots);
+            }
+        }
+    }
+}
+dispatched! {
+    fn second_level<const F: usize>(level: Level, table: &[f32], positions: &[[f32; 3]], g: &[f32], d_n: &[[f32; 3]],
+                                    to: &mut [[f32; 3]], at: Columns) = second_level_body
+}
+
+#[inline(always)]
+fn scatter_level_body<const F: usize>(level: Level, batch: &Scatter<'_>, grads: &mut [f32], at: Columns) {
+    let scale = level.cells as f32;
+    for (block, block_positions) in batch.positions.chunks(AHEAD).enumerate() {
+        let cells = cells_of(&level, block_positions);
+        for (j, cell) in cells.iter().enumerate().take(block_positions.len()) {
+            let i = block * AHEAD + j;
+            let d_e = at.of::<F>(batch.d_features, i);
+            let weights = cell.weights();
+            match batch.gradient {
+                None => {
+                    for c in 0..8 {
+                        let to = &mut grads[cell.corners[c] as usize * F..][..F];
+                        for f in 0..F {
+                            to[f] += weights[c] * d_e[f];
+                        }
+                    }
+                }
+                Some((g, d_n)) => {
+                    let g = at.of::<F>(g, i);
+                    let tangents = cell.weight_tangents(d_n[i], scale);
+                    for c in 0..8 {
+                        let to = &mut grads[cell.corners[c] as usize * F..][..F];
+                        for f in 0..F {
+                            to[f] += weights[c] * d_e[f] + tangents[c] * g[f];
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+dispatched! {
+    fn scatter_level<const F: usize>(level: Level, batch: &Scatter<'_>, grads: &mut [f32], at: Columns) = scatter_level_body
 }
 
 impl HashGrid {
@@ -214,6 +439,29 @@ impl HashGrid {
         (0..self.len).map(|_| rng.random_range(-1e-4..1e-4)).collect()
     }
 
+    /// The first `active` levels, with their parts of a table and their columns in rows of features.
+    fn active<'a>(
+        &'a self,
+        active: usize,
+        table: &'a [f32],
+        stride: usize,
+        first: usize,
+    ) -> impl Iterator<Item = (Level, &'a [f32], Columns)> {
+        let features = self.options.features;
+        self.levels.iter().take(active).enumerate().map(move |(l, level)| {
+            let part = &table[level.offset..level.offset + level.entries as usize * features];
+            (*level, part, Columns { stride, first: first + l * features })
+        })
+    }
+
+    /// Clears the columns of the levels from `active` on.
+    fn clear_inactive(&self, active: usize, out: &mut [f32], stride: usize, first: usize) {
+        let columns = first + active.min(self.options.levels) * self.options.features..first + self.width();
+        if !columns.is_empty() {
+            out.chunks_exact_mut(stride).for_each(|row| row[columns.clone()].fill(0.0));
+        }
+    }
+
     /// Writes the features of `positions` to `out`: `[samples, stride]`, from column `first`. Levels from `active` on
     /// give zeros.
     pub fn forward(
@@ -225,34 +473,10 @@ impl HashGrid {
         stride: usize,
         first: usize,
     ) {
-        with_features!(self, forward_f(table, positions, active, out, stride, first));
-    }
-
-    fn forward_f<const F: usize>(
-        &self,
-        table: &[f32],
-        positions: &[[f32; 3]],
-        active: usize,
-        out: &mut [f32],
-        stride: usize,
-        first: usize,
-    ) {
-        for (l, level) in self.levels.iter().enumerate() {
-            for (p, row) in positions.iter().zip(out.chunks_exact_mut(stride)) {
-                let mut sum = [0.0; F];
-                if l < active {
-                    let cell = level.cell(*p);
-                    for c in 0..8 {
-                        let w = cell.weight(c);
-                        let theta = entry::<F>(table, level, cell.corners[c]);
-                        for f in 0..F {
-                            sum[f] += w * theta[f];
-                        }
-                    }
-                }
-                row[first + l * F..first + (l + 1) * F].copy_from_slice(&sum);
-            }
+        for (level, table, at) in self.active(active, table, stride, first) {
+            with_features!(self.options.features, encode_level(level, table, positions, out, at));
         }
+        self.clear_inactive(active, out, stride, first);
     }
 
     /// Adds the gradient with respect to position of `g . e(x)` to `normals`; `g` is laid out like the features.
@@ -266,44 +490,13 @@ impl HashGrid {
         first: usize,
         normals: &mut [[f32; 3]],
     ) {
-        with_features!(self, input_gradient_f(table, positions, active, g, stride, first, normals));
-    }
-
-    #[allow(clippy::too_many_arguments)]
-    fn input_gradient_f<const F: usize>(
-        &self,
-        table: &[f32],
-        positions: &[[f32; 3]],
-        active: usize,
-        g: &[f32],
-        stride: usize,
-        first: usize,
-        normals: &mut [[f32; 3]],
-    ) {
-        for (l, level) in self.levels.iter().enumerate().take(active) {
-            let scale = level.cells as f32;
-            for ((p, row), n) in positions.iter().zip(g.chunks_exact(stride)).zip(normals.iter_mut()) {
-                let cell = level.cell(*p);
-                let g = &row[first + l * F..first + (l + 1) * F];
-                let mut sum = [0.0; 3];
-                for c in 0..8 {
-                    let theta = entry::<F>(table, level, cell.corners[c]);
-                    let dot: f32 = (0..F).map(|f| g[f] * theta[f]).sum();
-                    let dw = cell.weight_gradient(c);
-                    for d in 0..3 {
-                        sum[d] += dw[d] * dot;
-                    }
-                }
-                for d in 0..3 {
-                    n[d] += scale * sum[d];
-                }
-            }
+        for (level, table, at) in self.active(active, table, stride, first) {
+            with_features!(self.options.features, gradient_level(level, table, positions, g, normals, at));
         }
     }
 
     /// Writes dg, the derivative with respect to g of a loss whose derivative with respect to the gradient n is `d_n`,
     /// to `d_g`, laid out like the features. Inactive levels give zeros.
-    #[allow(clippy::too_many_arguments)]
     pub fn tangent(
         &self,
         table: &[f32],
@@ -314,37 +507,10 @@ impl HashGrid {
         stride: usize,
         first: usize,
     ) {
-        with_features!(self, tangent_f(table, positions, active, d_n, d_g, stride, first));
-    }
-
-    #[allow(clippy::too_many_arguments)]
-    fn tangent_f<const F: usize>(
-        &self,
-        table: &[f32],
-        positions: &[[f32; 3]],
-        active: usize,
-        d_n: &[[f32; 3]],
-        d_g: &mut [f32],
-        stride: usize,
-        first: usize,
-    ) {
-        for (l, level) in self.levels.iter().enumerate() {
-            let scale = level.cells as f32;
-            for ((p, row), n) in positions.iter().zip(d_g.chunks_exact_mut(stride)).zip(d_n) {
-                let mut sum = [0.0; F];
-                if l < active {
-                    let cell = level.cell(*p);
-                    for c in 0..8 {
-                        let w = scale * cell.weight_tangent(c, *n);
-                        let theta = entry::<F>(table, level, cell.corners[c]);
-                        for f in 0..F {
-                            sum[f] += w * theta[f];
-                        }
-                    }
-                }
-                row[first + l * F..first + (l + 1) * F].copy_from_slice(&sum);
-            }
+        for (level, table, at) in self.active(active, table, stride, first) {
+            with_features!(self.options.features, tangent_level(level, table, positions, d_n, d_g, at));
         }
+        self.clear_inactive(active, d_g, stride, first);
     }
 
     /// Adds to `to` what a loss with derivative `d_n` on the gradient n of `g . e(x)` sends back to the position:
@@ -360,34 +526,8 @@ impl HashGrid {
         first: usize,
         to: &mut [[f32; 3]],
     ) {
-        with_features!(self, second_gradient_f(table, positions, active, g, d_n, stride, first, to));
-    }
-
-    fn second_gradient_f<const F: usize>(
-        &self,
-        table: &[f32],
-        positions: &[[f32; 3]],
-        active: usize,
-        g: &[f32],
-        d_n: &[[f32; 3]],
-        stride: usize,
-        first: usize,
-        to: &mut [[f32; 3]],
-    ) {
-        for (l, level) in self.levels.iter().enumerate().take(active) {
-            let scale = (level.cells as f32) * (level.cells as f32);
-            for (((p, g), d_n), to) in positions.iter().zip(g.chunks_exact(stride)).zip(d_n).zip(to.iter_mut()) {
-                let g = &g[first + l * F..first + (l + 1) * F];
-                let cell = level.cell(*p);
-                for c in 0..8 {
-                    let theta = entry::<F>(table, level, cell.corners[c]);
-                    let value: f32 = scale * (0..F).map(|f| g[f] * theta[f]).sum::<f32>();
-                    let second = cell.weight_second(c, *d_n);
-                    for d in 0..3 {
-                        to[d] += value * second[d];
-                    }
-                }
-            }
+        for (level, table, at) in self.active(active, table, stride, first) {
+            with_features!(self.options.features, second_level(level, table, positions, g, d_n, to, at));
         }
     }
 
@@ -401,47 +541,13 @@ impl HashGrid {
             parts.push(part);
             rest = tail;
         }
-        parts.into_par_iter().enumerate().take(active).for_each(|(l, part)| {
+        let features = self.options.features;
+        parts.into_par_iter().zip(&self.levels).enumerate().take(active).for_each(|(l, (part, level))| {
             for batch in batches {
-                with_features!(self, scatter_level(l, batch, part));
+                let at = Columns { stride: batch.stride, first: batch.first + l * features };
+                with_features!(features, scatter_level(*level, batch, part, at));
             }
         });
-    }
-
-    fn scatter_level<const F: usize>(&self, l: usize, batch: &Scatter<'_>, grads: &mut [f32]) {
-        let level = &self.levels[l];
-        let scale = level.cells as f32;
-        let columns = batch.first + l * F..batch.first + (l + 1) * F;
-        for (s, p) in batch.positions.iter().enumerate() {
-            let row = s * batch.stride;
-            let d_e: &[f32] = &batch.d_features[row + columns.start..row + columns.end];
-            let cell = level.cell(*p);
-            match batch.gradient {
-                None => {
-                    if d_e.iter().all(|v| *v == 0.0) {
-                        continue;
-                    }
-                    for c in 0..8 {
-                        let w = cell.weight(c);
-                        let at = cell.corners[c] as usize * F;
-                        for (to, d) in grads[at..at + F].iter_mut().zip(d_e) {
-                            *to += w * d;
-                        }
-                    }
-                }
-                Some((g, d_n)) => {
-                    let g = &g[row + columns.start..row + columns.end];
-                    for c in 0..8 {
-                        let w = cell.weight(c);
-                        let tangent = scale * cell.weight_tangent(c, d_n[s]);
-                        let at = cell.corners[c] as usize * F;
-                        for ((to, d), g) in grads[at..at + F].iter_mut().zip(d_e).zip(g) {
-                            *to += w * d + tangent * g;
-                        }
-                    }
-                }
-            }
-        }
     }
 }
 

@@ -383,27 +383,27 @@ unsafe fn block<V: Vector, const MR: usize, const NV: usize>(p: &Product<'_>, ro
 /// Compiles a plain loop for each instruction set and calls the best that the processor has. The body is an
 /// `#[inline(always)]` function, which the compiler vectorises in each setting.
 macro_rules! dispatched {
-    ($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $ty:ty),* $(,)?) = $body:ident) => {
+    ($(#[$meta:meta])* $vis:vis fn $name:ident$(<const $c:ident: usize>)?($($arg:ident: $ty:ty),* $(,)?) = $body:ident) => {
         $(#[$meta])*
         #[allow(clippy::too_many_arguments)]
-        $vis fn $name($($arg: $ty),*) {
+        $vis fn $name$(<const $c: usize>)?($($arg: $ty),*) {
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx2,fma")]
                 #[allow(clippy::too_many_arguments)]
-                fn avx2($($arg: $ty),*) { $body($($arg),*) }
+                fn avx2$(<const $c: usize>)?($($arg: $ty),*) { $body$(::<$c>)?($($arg),*) }
                 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx2,fma")]
                 #[allow(clippy::too_many_arguments)]
-                fn avx512($($arg: $ty),*) { $body($($arg),*) }
+                fn avx512$(<const $c: usize>)?($($arg: $ty),*) { $body$(::<$c>)?($($arg),*) }
                 match $crate::simd::Isa::detected() {
                     // SAFETY: the processor was asked.
-                    $crate::simd::Isa::Avx512 => return unsafe { avx512($($arg),*) },
+                    $crate::simd::Isa::Avx512 => return unsafe { avx512$(::<$c>)?($($arg),*) },
                     // SAFETY: the processor was asked.
-                    $crate::simd::Isa::Avx2 => return unsafe { avx2($($arg),*) },
+                    $crate::simd::Isa::Avx2 => return unsafe { avx2$(::<$c>)?($($arg),*) },
                     $crate::simd::Isa::Portable => {}
                 }
             }
-            $body($($arg),*);
+            $body$(::<$c>)?($($arg),*);
         }
     };
 }
