@@ -105,8 +105,9 @@ def points(folder):
     sequence(folder / "seq")
     write_ply(folder / "pred.ply", *sphere(500, bumps=0.005))
     heads("points (500,000 triangles)", [*PROTOCOLS, "published algorithm"])
-    for n in [10_000, 30_000, 100_000, 300_000, 1_000_000]:
-        peers = peer(folder / "seq", folder / "pred.ply", n) if n <= 300_000 else None
+    for n in [10_000, 100_000, 1_000_000]:
+        # For a million points the published algorithm would take far more than five minutes.
+        peers = peer(folder / "seq", folder / "pred.ply", n) if n <= 100_000 else None
         row(f"{n:,}", [*(ours(folder / "seq", folder / "pred.ply", p, n) for p in PROTOCOLS), peers])
 
 
