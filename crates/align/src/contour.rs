@@ -17,6 +17,11 @@ use crate::profile::{Candidates, MAX_RANGE_PX, Pyramid, candidates};
 /// times what independent samples would leave.
 const CORRELATION: f64 = 3.0;
 
+/// The errors that different edges of a photograph have in common (light that falls from one side, neighbours that pull,
+/// edges that every start leads to but are not the model's) leave the pose this many times further off than the edges'
+/// own scatter says. Measured: on eleven alignments of eight simulated captures the ratio was 2.1 to 5.7, 3 in the middle.
+const COMMON_ERRORS: f64 = 3.0;
+
 /// One photograph.
 pub(crate) struct ContourFrame {
     pub intrinsics: Intrinsics,
@@ -465,7 +470,8 @@ impl ContourFit<'_> {
     }
 
     /// The inverse of the normal equations around the sandwich of scores summed over each edge in each frame (the
-    /// cluster-robust covariance of White 1980 and Liang and Zeger 1986): samples of one edge err together.
+    /// cluster-robust covariance of White 1980 and Liang and Zeger 1986): samples of one edge err together. What edges
+    /// have in common is beyond it, and added as [`COMMON_ERRORS`].
     pub fn uncertainty(&self, observed: &Observed, limit_px: f64) -> Option<Uncertainty> {
         let noise = self.noise_px(observed, limit_px);
         let equations = self.equations(observed, limit_px, &noise);
@@ -478,7 +484,7 @@ impl ContourFit<'_> {
                 let mut g = DVector::zeros(OBJECT + 6);
                 g.rows_mut(0, OBJECT).copy_from(&sum.0);
                 g.rows_mut(OBJECT, 6).copy_from(&sum.1);
-                let outer = &g * g.transpose();
+                let outer = &g * g.transpose() * COMMON_ERRORS.powi(2);
                 for (from_row, to_row, rows) in [(0, 0, OBJECT), (OBJECT, at, 6)] {
                     for (from_col, to_col, cols) in [(0, 0, OBJECT), (OBJECT, at, 6)] {
                         let mut block = scores.view_mut((to_row, to_col), (rows, cols));

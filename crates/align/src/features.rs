@@ -52,7 +52,13 @@ pub fn detect_features(photograph: &RgbImage, options: &FeatureOptions) -> Vec<F
     let mut features = Vec::new();
     while let Some(base) = octave {
         let scales = Octave::new(base);
-        for extremum in extrema(&scales, options) {
+        let mut found = extrema(&scales, options);
+        if options.most > 0 {
+            // Those that the others of their own octave outdo are not kept anyway; describing costs more than finding.
+            found.sort_by(|a, b| b.contrast.total_cmp(&a.contrast));
+            found.truncate(options.most);
+        }
+        for extremum in found {
             for angle in orientations(&scales, &extremum) {
                 features.push(describe(&scales, &extremum, angle, pixel_size));
             }
@@ -181,11 +187,12 @@ fn orientations(octave: &Octave, e: &Extremum) -> Vec<f32> {
     let radius = (3.0 * sigma).round() as isize;
     let plane = octave.nearest_plane(e.scale);
     let mut histogram = [0.0f32; BINS];
-    for dy in -radius..=radius {
-        for dx in -radius..=radius {
+    let window = window(radius, 0.0, sigma);
+    for (dy, down) in (-radius..=radius).zip(&window) {
+        for (dx, across) in (-radius..=radius).zip(&window) {
             let Some((gx, gy)) = plane.gradient(e.x.round() as isize + dx, e.y.round() as isize + dy) else { continue };
-            let weight = (-((dx * dx + dy * dy) as f32) / (2.0 * sigma * sigma)).exp();
-            let angle = gy.atan2(gx).rem_euclid(std::f32::consts::TAU);
+            let weight = across * down;
+            let angle = direction(gx, gy);
             let bin = (angle / std::f32::consts::TAU * BINS as f32).round() as usize % BINS;
             histogram[bin] += weight * (gx * gx + gy * gy).sqrt();
         }
@@ -208,6 +215,24 @@ fn orientations(octave: &Octave, e: &Extremum) -> Vec<f32> {
     angles
 }
 
+/// A Gaussian about `-offset` at the integers from `-radius` to `radius`: two of them make one of the plane.
+fn window(radius: isize, offset: f32, sigma: f32) -> Vec<f32> {
+    (-radius..=radius).map(|d| (-((d as f32 + offset) / sigma).powi(2) / 2.0).exp()).collect()
+}
+
+/// The direction of a gradient, radians from x towards y, in [0, 2 pi]; within 1e-5 of `atan2`, at a fifth of its time
+/// (a minimax polynomial of the arc tangent up to 45 degrees, and reflections).
+fn direction(x: f32, y: f32) -> f32 {
+    use std::f32::consts::{FRAC_PI_2, PI, TAU};
+    const ODD: [f32; 6] = [0.999_977_26, -0.332_623_47, 0.193_543_46, -0.116_432_87, 0.052_653_32, -0.011_721_2];
+    let (ax, ay) = (x.abs(), y.abs());
+    let t = ax.min(ay) / ax.max(ay).max(f32::MIN_POSITIVE);
+    let angle = t * ODD.iter().rev().fold(0.0, |sum, c| sum * t * t + c);
+    let angle = if ay > ax { FRAC_PI_2 - angle } else { angle };
+    let angle = if x < 0.0 { PI - angle } else { angle };
+    if y < 0.0 { TAU - angle } else { angle }
+}
+
 fn describe(octave: &Octave, e: &Extremum, angle: f32, pixel_size: f64) -> Feature {
     const CELLS: usize = 4;
     const DIRECTIONS: usize = 8;
@@ -218,9 +243,13 @@ fn describe(octave: &Octave, e: &Extremum, angle: f32, pixel_size: f64) -> Featu
     let (column, row) = (e.x.round() as isize, e.y.round() as isize);
     // One cell of margin on every side takes what falls outside.
     let mut cells = [[[0.0f32; DIRECTIONS]; CELLS + 2]; CELLS + 2];
-    for dy in -radius..=radius {
-        for dx in -radius..=radius {
-            let (px, py) = (dx as f32 + column as f32 - e.x, dy as f32 + row as f32 - e.y);
+    // A Gaussian as wide as half of all cells (turning does not change it).
+    let sigma = 0.5 * CELLS as f32 * cell_px;
+    let (left, above) = (column as f32 - e.x, row as f32 - e.y);
+    let (window_x, window_y) = (window(radius, left, sigma), window(radius, above, sigma));
+    for (dy, weight_y) in (-radius..=radius).zip(&window_y) {
+        for (dx, weight_x) in (-radius..=radius).zip(&window_x) {
+            let (px, py) = (dx as f32 + left, dy as f32 + above);
             let u = (cos * px + sin * py) / cell_px;
             let v = (cos * py - sin * px) / cell_px;
             let (across, down) = (u + CELLS as f32 / 2.0 - 0.5, v + CELLS as f32 / 2.0 - 0.5);
@@ -229,11 +258,12 @@ fn describe(octave: &Octave, e: &Extremum, angle: f32, pixel_size: f64) -> Featu
                 continue;
             }
             let Some((gx, gy)) = plane.gradient(column + dx, row + dy) else { continue };
-            let weight = (-(u * u + v * v) / (0.5 * limit * limit)).exp() * (gx * gx + gy * gy).sqrt();
-            let direction =
-                (gy.atan2(gx) - angle).rem_euclid(std::f32::consts::TAU) / std::f32::consts::TAU * DIRECTIONS as f32;
-            let (c, r, o) = (across.floor(), down.floor(), direction.floor());
-            let (fc, fr, fo) = (across - c, down - r, direction - o);
+            let weight = weight_x * weight_y * (gx * gx + gy * gy).sqrt();
+            let turn = direction(gx, gy) - angle;
+            let turn = if turn < 0.0 { turn + std::f32::consts::TAU } else { turn };
+            let turn = turn / std::f32::consts::TAU * DIRECTIONS as f32;
+            let (c, r, o) = (across.floor(), down.floor(), turn.floor());
+            let (fc, fr, fo) = (across - c, down - r, turn - o);
             for (i, row_share) in [(0, 1.0 - fr), (1, fr)] {
                 for (j, column_share) in [(0, 1.0 - fc), (1, fc)] {
                     let cell = &mut cells[(r as isize + 1) as usize + i][(c as isize + 1) as usize + j];
@@ -262,5 +292,23 @@ fn describe(octave: &Octave, e: &Extremum, angle: f32, pixel_size: f64) -> Featu
         angle_rad: f64::from(angle),
         contrast: f64::from(e.contrast),
         descriptor: values.map(|v| (255.0 * (v / sum).sqrt()).round().min(255.0) as u8),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn directions_are_those_of_the_arc_tangent() {
+        for i in 0..3600 {
+            let angle = (i as f32 / 3600.0) * std::f32::consts::TAU;
+            let length = 10f32.powi(i % 9 - 6);
+            let (x, y) = (length * angle.cos(), length * angle.sin());
+            let expected = y.atan2(x).rem_euclid(std::f32::consts::TAU);
+            let off = (direction(x, y) - expected).abs();
+            assert!(off.min(std::f32::consts::TAU - off) < 1e-5, "{i}: {} is not {expected}", direction(x, y));
+        }
+        assert_eq!(direction(0.0, 0.0), 0.0);
     }
 }

@@ -1,6 +1,7 @@
 //! Gaussian scale space of a grey image, octave by octave.
 
 use mb_image::RgbImage;
+use multiversion::multiversion;
 
 /// A grey image, brightness in [0, 1], row-major.
 #[derive(Debug, Clone)]
@@ -70,41 +71,44 @@ impl Plane {
         let (width, height) = (self.width, self.height);
         let mut across = vec![0.0f32; width * height];
         let mut padded = vec![0.0f32; width + 2 * radius];
-        for y in 0..height {
+        for (y, out) in across.chunks_exact_mut(width).enumerate() {
             let row = self.row(y);
             padded[..radius].fill(row[0]);
             padded[radius..radius + width].copy_from_slice(row);
             padded[radius + width..].fill(row[width - 1]);
-            let out = &mut across[y * width..(y + 1) * width];
-            // Symmetric: two taps at once.
-            for (o, p) in out.iter_mut().zip(&padded[radius..]) {
-                *o = kernel[radius] * p;
-            }
-            for k in 0..radius {
-                let (left, right) = (&padded[k..k + width], &padded[2 * radius - k..2 * radius - k + width]);
-                for ((o, a), b) in out.iter_mut().zip(left).zip(right) {
-                    *o += kernel[k] * (a + b);
-                }
-            }
+            weighted_sum(out, &kernel, |k| &padded[k..k + width]);
         }
         let mut data = vec![0.0f32; width * height];
-        let row_at = |y: isize| {
-            let y = y.clamp(0, height as isize - 1) as usize;
-            &across[y * width..(y + 1) * width]
-        };
-        for y in 0..height {
-            let out = &mut data[y * width..(y + 1) * width];
-            for (o, p) in out.iter_mut().zip(row_at(y as isize)) {
-                *o = kernel[radius] * p;
-            }
-            for k in 0..radius {
-                let reach = (radius - k) as isize;
-                for ((o, a), b) in out.iter_mut().zip(row_at(y as isize - reach)).zip(row_at(y as isize + reach)) {
-                    *o += kernel[k] * (a + b);
-                }
-            }
+        for (y, out) in data.chunks_exact_mut(width).enumerate() {
+            weighted_sum(out, &kernel, |k| {
+                let y = (y + k).saturating_sub(radius).min(height - 1);
+                &across[y * width..(y + 1) * width]
+            });
         }
         Self { width, height, data }
+    }
+}
+
+/// The sum of rows, each with its weight of a symmetric kernel of odd length; `row(k)` is the row of weight `k`.
+fn weighted_sum<'a>(out: &mut [f32], kernel: &[f32], row: impl Fn(usize) -> &'a [f32]) {
+    let radius = kernel.len() / 2;
+    scale(out, row(radius), kernel[radius]);
+    for k in 0..radius {
+        add_pair(out, row(k), row(2 * radius - k), kernel[k]);
+    }
+}
+
+#[multiversion(targets("x86_64+avx2"))]
+fn scale(out: &mut [f32], row: &[f32], weight: f32) {
+    for (o, p) in out.iter_mut().zip(row) {
+        *o = weight * p;
+    }
+}
+
+#[multiversion(targets("x86_64+avx2"))]
+fn add_pair(out: &mut [f32], a: &[f32], b: &[f32], weight: f32) {
+    for ((o, a), b) in out.iter_mut().zip(a).zip(b) {
+        *o += weight * (a + b);
     }
 }
 
