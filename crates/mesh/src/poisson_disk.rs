@@ -3,8 +3,6 @@
 //! Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets", Computer Graphics Forum 34(2), 2015, with the
 //! parameters and the weight of Open3D 0.19 (`SamplePointsPoissonDisk`), which the published scorer calls.
 
-use std::ops::Range;
-
 use mb_geometry::Aabb;
 use nalgebra::Point3;
 use rayon::prelude::*;
@@ -41,14 +39,14 @@ fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64
     let weights: Vec<f64> = (0..count)
         .into_par_iter()
         .with_min_len(4096)
-        .map(|i| {
-            let mut weight = 0.0;
-            for run in grid.runs_around(i) {
-                weight = grid.points[run].iter().fold(weight, |sum, p| sum + p.crowding(&grid.points[i], floor));
-            }
-            // The point itself is no neighbour.
-            weight - crowding(0.0, floor)
-        })
+        .map_init(
+            || grid.room(),
+            |room, i| {
+                let weight = grid.near(i, room).iter().fold(0.0, |sum, near| sum + crowding(near.squared, floor));
+                // The point itself is no neighbour.
+                weight - crowding(0.0, floor)
+            },
+        )
         .collect();
     for (point, weight) in grid.points.iter_mut().zip(weights) {
         point.weight = weight;
@@ -67,9 +65,11 @@ fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64
         grid.compact(&mut order);
     }
     let mut queue = Queue::new(&grid.points);
+    let mut room = grid.room();
     for _ in 0..surplus {
         let Some(i) = queue.pop_most_crowded(&grid.points) else { break };
-        grid.remove(i as usize, floor);
+        let near = grid.near(i as usize, &mut room);
+        remove(&mut grid.points, i as usize, near, floor);
     }
     let mut survivors: Vec<u32> =
         order.into_iter().zip(&grid.points).filter(|(_, point)| !point.is_removed()).map(|(i, _)| i).collect();
@@ -184,13 +184,14 @@ impl Candidate {
     fn is_removed(&self) -> bool {
         self.weight == f64::NEG_INFINITY
     }
+}
 
-    /// How much two points crowd each other.
-    #[inline]
-    fn crowding(&self, other: &Candidate, floor: f64) -> f64 {
-        let [x, y, z] = [0, 1, 2].map(|axis| self.at[axis] - other.at[axis]);
-        crowding(x * x + y * y + z * z, floor)
-    }
+/// A point within the reach of another.
+#[derive(Clone, Copy, Default)]
+struct Near {
+    /// Squared distance in reaches, below 1.
+    squared: f64,
+    point: u32,
 }
 
 /// (1 - d / reach)^8 from the squared distance in reaches, 0 beyond the reach.
@@ -289,17 +290,6 @@ impl Grid {
         }
     }
 
-    /// Takes a point away; those around it are less crowded.
-    fn remove(&mut self, i: usize, floor: f64) {
-        let gone = self.points[i];
-        for run in self.runs_around(i) {
-            for p in &mut self.points[run] {
-                p.weight -= p.crowding(&gone, floor);
-            }
-        }
-        self.points[i].weight = f64::NEG_INFINITY;
-    }
-
     /// Removes the most crowded point until none is above `limit`; returns how many went.
     ///
     /// The result is that of removing them in the order of their weights. Weights only ever fall, and fall only where a
@@ -308,15 +298,28 @@ impl Grid {
     fn remove_above(&mut self, limit: f64, floor: f64) -> usize {
         let mut removed = 0;
         let mut waiting = Vec::new();
+        let mut room = self.room();
         for start in 0..self.points.len() {
             waiting.push(start);
             while let Some(&i) = waiting.last() {
-                if self.points[i].weight <= limit {
+                let weight = self.points[i].weight;
+                if weight <= limit {
                     waiting.pop();
-                } else if let Some(first) = self.most_crowded_around(i) {
-                    waiting.push(first);
+                    continue;
+                }
+                let near = self.near(i, &mut room);
+                // Of equal ones the lowest number counts as more crowded.
+                let mut most = (weight, i);
+                for point in near.iter().map(|near| near.point as usize) {
+                    let weight = self.points[point].weight;
+                    if weight > most.0 || (weight == most.0 && point < most.1) {
+                        most = (weight, point);
+                    }
+                }
+                if most.1 != i {
+                    waiting.push(most.1);
                 } else {
-                    self.remove(i, floor);
+                    remove(&mut self.points, i, near, floor);
                     removed += 1;
                     waiting.pop();
                 }
@@ -325,26 +328,35 @@ impl Grid {
         removed
     }
 
-    /// The most crowded neighbour of point `i`, if it is more crowded than the point. Of equal ones the lowest number counts
-    /// as more crowded.
-    fn most_crowded_around(&self, i: usize) -> Option<usize> {
-        let point = self.points[i];
-        let mut most = (point.weight, i);
-        for run in self.runs_around(i) {
-            let first = run.start;
-            for (at, p) in self.points[run].iter().enumerate() {
-                if p.weight >= most.0 && (p.weight > most.0 || first + at < most.1) && p.crowding(&point, 0.0) > 0.0 {
-                    most = (p.weight, first + at);
-                }
-            }
-        }
-        (most.1 != i).then_some(most.1)
+    /// Room for the points that [`Grid::near`] looks at.
+    fn room(&self) -> Vec<Near> {
+        let around = |runs: &[(u32, u32); 9]| runs.iter().map(|(first, end)| (end - first) as usize).sum();
+        vec![Near::default(); self.runs.iter().map(around).max().unwrap_or(0) + 1]
     }
 
-    /// The runs of points around point `i`, itself included.
-    fn runs_around(&self, i: usize) -> [Range<usize>; 9] {
-        self.runs[self.cell_of_point[i] as usize].map(|(first, end)| first as usize..end as usize)
+    /// The points within reach of point `i`, itself included, by number.
+    fn near<'a>(&self, i: usize, room: &'a mut [Near]) -> &'a [Near] {
+        let [x, y, z] = self.points[i].at;
+        let mut count = 0;
+        for (first, end) in self.runs[self.cell_of_point[i] as usize] {
+            for (point, p) in (first..end).zip(&self.points[first as usize..end as usize]) {
+                let (dx, dy, dz) = (p.at[0] - x, p.at[1] - y, p.at[2] - z);
+                let squared = dx * dx + dy * dy + dz * dz;
+                // Always written, and kept where it counts: a guess would be wrong too often.
+                room[count] = Near { squared, point };
+                count += usize::from(squared < 1.0);
+            }
+        }
+        &room[..count]
     }
+}
+
+/// Takes point `i` away; those near it are less crowded.
+fn remove(points: &mut [Candidate], i: usize, near: &[Near], floor: f64) {
+    for near in near {
+        points[near.point as usize].weight -= crowding(near.squared, floor);
+    }
+    points[i].weight = f64::NEG_INFINITY;
 }
 
 #[cfg(test)]

@@ -24,21 +24,33 @@ const PARALLEL_FROM: usize = 32_768;
 /// 2^32 triangles need 32 more levels.
 const COUNT_SPLIT_FROM: usize = MAX_DEPTH - 34;
 
+/// Three coordinates and a spare lane: four of them are one register of the processor.
+type Lanes = [f32; 4];
+
+// Not `f32::min`, which has more instructions for NaN; none comes here.
+fn lesser(a: Lanes, b: Lanes) -> Lanes {
+    std::array::from_fn(|lane| if a[lane] < b[lane] { a[lane] } else { b[lane] })
+}
+
+fn greater(a: Lanes, b: Lanes) -> Lanes {
+    std::array::from_fn(|lane| if a[lane] > b[lane] { a[lane] } else { b[lane] })
+}
+
 /// A box in `f32`.
 #[derive(Clone, Copy)]
+#[repr(align(16))]
 struct Box3 {
-    min: [f32; 3],
-    max: [f32; 3],
+    min: Lanes,
+    max: Lanes,
 }
 
 impl Box3 {
-    const EMPTY: Self = Self { min: [f32::INFINITY; 3], max: [f32::NEG_INFINITY; 3] };
+    const EMPTY: Self = Self { min: [f32::INFINITY; 4], max: [f32::NEG_INFINITY; 4] };
 
+    #[inline]
     fn add(&mut self, other: &Self) {
-        for axis in 0..3 {
-            self.min[axis] = self.min[axis].min(other.min[axis]);
-            self.max[axis] = self.max[axis].max(other.max[axis]);
-        }
+        self.min = lesser(self.min, other.min);
+        self.max = greater(self.max, other.max);
     }
 
     fn half_area(&self) -> f32 {
@@ -47,17 +59,30 @@ impl Box3 {
     }
 }
 
-/// A triangle while the tree is built.
+/// A triangle while the tree is built: its box, whose spare lane holds its number.
 #[derive(Clone, Copy)]
-struct Primitive {
-    bounds: Box3,
-    triangle: u32,
-}
+struct Primitive(Box3);
 
 impl Primitive {
+    fn new(corners: &[Point3<f64>; 3], triangle: u32) -> Self {
+        let [a, b, c] = corners;
+        let mut bounds = Box3 { min: [0.0; 4], max: [0.0; 4] };
+        for axis in 0..3 {
+            bounds.min[axis] = round_down(a[axis].min(b[axis]).min(c[axis]));
+            bounds.max[axis] = round_up(a[axis].max(b[axis]).max(c[axis]));
+        }
+        bounds.max[3] = f32::from_bits(triangle);
+        Self(bounds)
+    }
+
+    fn triangle(&self) -> u32 {
+        self.0.max[3].to_bits()
+    }
+
     /// Twice the middle of the box, which sorts like the middle.
-    fn centre2(&self, axis: usize) -> f32 {
-        self.bounds.min[axis] + self.bounds.max[axis]
+    #[inline]
+    fn centre2(&self) -> Lanes {
+        std::array::from_fn(|axis| self.0.min[axis] + self.0.max[axis])
     }
 }
 
@@ -73,14 +98,6 @@ fn round_up(v: f64) -> f32 {
     if f64::from(r) < v { r.next_up() } else { r }
 }
 
-fn bounds_of(corners: &[Point3<f64>; 3]) -> Box3 {
-    let [a, b, c] = corners;
-    Box3 {
-        min: std::array::from_fn(|axis| round_down(a[axis].min(b[axis]).min(c[axis]))),
-        max: std::array::from_fn(|axis| round_up(a[axis].max(b[axis]).max(c[axis]))),
-    }
-}
-
 pub(super) fn build(mesh: &TriangleMesh) -> Bvh {
     let mut bvh = build_without_corners(mesh);
     bvh.corners = bvh.triangles.par_iter().map(|&t| mesh.triangle(t as usize)).collect();
@@ -93,33 +110,33 @@ pub(super) fn build_without_corners(mesh: &TriangleMesh) -> Bvh {
         .filter_map(|index| {
             let corners = mesh.triangle(index);
             let finite = corners.iter().all(|p| p.coords.iter().all(|v| v.is_finite()));
-            finite.then(|| Primitive { bounds: bounds_of(&corners), triangle: index as u32 })
+            finite.then(|| Primitive::new(&corners, index as u32))
         })
         .collect();
-    let all = bounds(&primitives);
+    let extent = Extent::of(&primitives);
     let (nodes, root) =
-        if primitives.is_empty() { (Vec::new(), Child::default()) } else { subtree(&mut primitives, &all, 0, 0) };
-    let triangles: Vec<u32> = primitives.par_iter().map(|p| p.triangle).collect();
+        if primitives.is_empty() { (Vec::new(), Child::default()) } else { subtree(&mut primitives, &extent, 0, 0) };
+    let triangles: Vec<u32> = primitives.par_iter().map(Primitive::triangle).collect();
     Bvh { nodes, root, corners: Vec::new(), triangles }
 }
 
-/// Builds the subtree over `primitives`, which lie in the box `all`, stand at `first` in the final order and are reordered
+/// Builds the subtree over `primitives`, which reach over `extent`, stand at `first` in the final order and are reordered
 /// in place. Inner nodes are numbered from 0 within the subtree, its root first.
-fn subtree(primitives: &mut [Primitive], all: &Box3, first: u32, depth: usize) -> (Vec<Node>, Child) {
+fn subtree(primitives: &mut [Primitive], extent: &Extent, first: u32, depth: usize) -> (Vec<Node>, Child) {
     let count = primitives.len();
     if count < PARALLEL_FROM {
         let mut nodes = Vec::with_capacity(count / 2);
-        let root = grow(primitives, all, first, depth, &mut nodes);
+        let root = grow(primitives, extent, first, depth, &mut nodes);
         return (nodes, root);
     }
-    let Some(middle) = split(primitives, all, depth) else {
+    let Some(middle) = split(primitives, extent, depth) else {
         return (Vec::new(), Child { first, count: count as u32 });
     };
     let (left, right) = primitives.split_at_mut(middle);
     let (boxes, ((left_nodes, left), (right_nodes, right))) = {
         let build = |half: &mut [Primitive], first: u32| {
-            let all = bounds(half);
-            (all, subtree(half, &all, first, depth + 1))
+            let extent = Extent::of(half);
+            (extent.bounds, subtree(half, &extent, first, depth + 1))
         };
         let (left, right) = rayon::join(|| build(left, first), || build(right, first + middle as u32));
         ([left.0, right.0], (left.1, right.1))
@@ -136,17 +153,17 @@ fn subtree(primitives: &mut [Primitive], all: &Box3, first: u32, depth: usize) -
 }
 
 /// Like [`subtree`] by one thread, which puts the inner nodes where they stay: behind those of `nodes`.
-fn grow(primitives: &mut [Primitive], all: &Box3, first: u32, depth: usize, nodes: &mut Vec<Node>) -> Child {
-    let Some(middle) = split(primitives, all, depth) else {
+fn grow(primitives: &mut [Primitive], extent: &Extent, first: u32, depth: usize, nodes: &mut Vec<Node>) -> Child {
+    let Some(middle) = split(primitives, extent, depth) else {
         return Child { first, count: primitives.len() as u32 };
     };
     let (left, right) = primitives.split_at_mut(middle);
-    let boxes = [bounds(left), bounds(right)];
+    let extents = [Extent::of(left), Extent::of(right)];
     let at = nodes.len();
     // The children are known when they are built; they follow their parent.
-    nodes.push(Node::new(&boxes, [Child::default(); 2]));
-    let left = grow(left, &boxes[0], first, depth + 1, nodes);
-    let right = grow(right, &boxes[1], first + middle as u32, depth + 1, nodes);
+    nodes.push(Node::new(&extents.map(|e| e.bounds), [Child::default(); 2]));
+    let left = grow(left, &extents[0], first, depth + 1, nodes);
+    let right = grow(right, &extents[1], first + middle as u32, depth + 1, nodes);
     nodes[at].children = [left, right];
     Child { first: at as u32, count: 0 }
 }
@@ -166,50 +183,91 @@ fn moved(child: Child, offset: u32) -> Child {
     if child.count > 0 { child } else { Child { first: child.first + offset, count: 0 } }
 }
 
-fn bounds(primitives: &[Primitive]) -> Box3 {
-    primitives.iter().fold(Box3::EMPTY, |mut all, p| {
-        all.add(&p.bounds);
-        all
-    })
+/// What some triangles reach over.
+#[derive(Clone, Copy)]
+struct Extent {
+    bounds: Box3,
+    /// Least and largest of [`Primitive::centre2`].
+    centres2: Box3,
+}
+
+impl Extent {
+    fn of(primitives: &[Primitive]) -> Self {
+        let mut extent = Self { bounds: Box3::EMPTY, centres2: Box3::EMPTY };
+        for p in primitives {
+            extent.bounds.add(&p.0);
+            let centre2 = p.centre2();
+            extent.centres2.add(&Box3 { min: centre2, max: centre2 });
+        }
+        extent
+    }
+}
+
+/// Bins of equal width between the least and the largest centre on each axis.
+struct Bins<const BINS: usize> {
+    low: Lanes,
+    /// Bins per unit; 0 on an axis along which no bin can tell the centres apart.
+    scale: Lanes,
+}
+
+impl<const BINS: usize> Bins<BINS> {
+    /// Added to a number of bins, this leaves it in bits 8 and up of the sum, in units of 2^-8 bins below. Rust's own
+    /// conversion to integers looks after numbers that none can hold, which takes longer than all the rest.
+    const SHIFT: f32 = 32768.0;
+
+    fn new(centres2: &Box3) -> Self {
+        let scale = std::array::from_fn(|axis| {
+            let extent = centres2.max[axis] - centres2.min[axis];
+            // Below this extent the quotient overflows.
+            if extent > f32::MIN_POSITIVE * 1e6 { (BINS as f32 - 0.01) / extent } else { 0.0 }
+        });
+        Self { low: centres2.min, scale }
+    }
+
+    #[inline]
+    fn of(&self, p: &Primitive) -> [usize; 3] {
+        let centre2 = p.centre2();
+        let shifted: Lanes =
+            std::array::from_fn(|axis| (centre2[axis] - self.low[axis]) * self.scale[axis] + Self::SHIFT);
+        [0, 1, 2].map(|axis| Self::number(shifted[axis]))
+    }
+
+    #[inline]
+    fn along(&self, axis: usize, p: &Primitive) -> usize {
+        let centre2 = p.0.min[axis] + p.0.max[axis];
+        Self::number((centre2 - self.low[axis]) * self.scale[axis] + Self::SHIFT)
+    }
+
+    #[inline]
+    fn number(shifted: f32) -> usize {
+        (shifted.to_bits() >> 8) as usize % BINS
+    }
 }
 
 /// Reorders `primitives` into two halves and returns where the second begins; `None` where one leaf is cheaper.
-fn split(primitives: &mut [Primitive], all: &Box3, depth: usize) -> Option<usize> {
+fn split(primitives: &mut [Primitive], extent: &Extent, depth: usize) -> Option<usize> {
     match primitives.len() {
         count if count <= MIN_LEAF => None,
-        count if count <= FEW => split_by_bins::<FEW_BINS>(primitives, all, depth),
-        _ => split_by_bins::<BINS>(primitives, all, depth),
+        count if count <= FEW => split_by_bins::<FEW_BINS>(primitives, extent, depth),
+        _ => split_by_bins::<BINS>(primitives, extent, depth),
     }
 }
 
-fn split_by_bins<const BINS: usize>(primitives: &mut [Primitive], all: &Box3, depth: usize) -> Option<usize> {
+fn split_by_bins<const BINS: usize>(primitives: &mut [Primitive], extent: &Extent, depth: usize) -> Option<usize> {
     let count = primitives.len();
-    let mut low = [f32::INFINITY; 3];
-    let mut high = [f32::NEG_INFINITY; 3];
-    for p in primitives.iter() {
-        for axis in 0..3 {
-            low[axis] = low[axis].min(p.centre2(axis));
-            high[axis] = high[axis].max(p.centre2(axis));
-        }
-    }
-    let scale: [f32; 3] = std::array::from_fn(|axis| {
-        let extent = high[axis] - low[axis];
-        // Below this extent the quotient overflows, and no bin can tell the centres apart.
-        if extent > f32::MIN_POSITIVE * 1e6 { BINS as f32 * (1.0 - 1e-6) / extent } else { 0.0 }
-    });
-    let bin_of = |p: &Primitive, axis: usize| (((p.centre2(axis) - low[axis]) * scale[axis]) as usize).min(BINS - 1);
-
-    let best = if depth >= COUNT_SPLIT_FROM { None } else { best_bin::<BINS>(primitives, all, &scale, bin_of) };
+    let bins = Bins::<BINS>::new(&extent.centres2);
+    let best = if depth >= COUNT_SPLIT_FROM { None } else { best_bin(primitives, &extent.bounds, &bins) };
     match best {
         Some((cost, axis, bin)) if count > MAX_LEAF || cost < count as f32 => {
-            Some(partition(primitives, |p| bin_of(p, axis) < bin))
+            Some(partition(primitives, |p| bins.along(axis, p) < bin))
         }
         Some(_) => None,
         None if count <= MAX_LEAF => None,
         // No plane separates the centres: they coincide, or the tree is already too deep for the heuristic.
         None => {
-            let axis = (0..3).max_by(|&a, &b| (high[a] - low[a]).total_cmp(&(high[b] - low[b]))).unwrap_or(0);
-            let key = |p: &Primitive| (p.centre2(axis), p.triangle);
+            let length = |axis: usize| extent.centres2.max[axis] - extent.centres2.min[axis];
+            let axis = (0..3).max_by(|&a, &b| length(a).total_cmp(&length(b))).unwrap_or(0);
+            let key = |p: &Primitive| (p.centre2()[axis], p.triangle());
             primitives.select_nth_unstable_by(count / 2, |a, b| {
                 let (a, b) = (key(a), key(b));
                 a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))
@@ -220,24 +278,20 @@ fn split_by_bins<const BINS: usize>(primitives: &mut [Primitive], all: &Box3, de
 }
 
 /// The cheapest border between bins over the three axes: cost, axis, and the first bin of the second half.
-fn best_bin<const BINS: usize>(
-    primitives: &[Primitive],
-    all: &Box3,
-    scale: &[f32; 3],
-    bin_of: impl Fn(&Primitive, usize) -> usize,
-) -> Option<(f32, usize, usize)> {
-    let mut bins = [[(Box3::EMPTY, 0u32); BINS]; 3];
+fn best_bin<const BINS: usize>(primitives: &[Primitive], all: &Box3, bins: &Bins<BINS>) -> Option<(f32, usize, usize)> {
+    let mut filled = [[(Box3::EMPTY, 0u32); BINS]; 3];
     for p in primitives {
-        for (axis, bins) in bins.iter_mut().enumerate() {
-            let (bounds, count) = &mut bins[bin_of(p, axis)];
-            bounds.add(&p.bounds);
+        let at = bins.of(p);
+        for (axis, filled) in filled.iter_mut().enumerate() {
+            let (bounds, count) = &mut filled[at[axis]];
+            bounds.add(&p.0);
             *count += 1;
         }
     }
     let whole = all.half_area().max(f32::MIN_POSITIVE);
     let mut best: Option<(f32, usize, usize)> = None;
-    for axis in (0..3).filter(|&axis| scale[axis] > 0.0) {
-        let bins = &bins[axis];
+    for axis in (0..3).filter(|&axis| bins.scale[axis] > 0.0) {
+        let bins = &filled[axis];
         let mut right_cost = [0.0f32; BINS];
         let (mut bounds, mut count) = (Box3::EMPTY, 0);
         for bin in (1..BINS).rev() {
@@ -263,10 +317,11 @@ fn best_bin<const BINS: usize>(
 fn partition(primitives: &mut [Primitive], is_left: impl Fn(&Primitive) -> bool) -> usize {
     let mut left = 0;
     for i in 0..primitives.len() {
-        if is_left(&primitives[i]) {
-            primitives.swap(left, i);
-            left += 1;
-        }
+        // Always exchanged, as it costs less than a guess that is wrong half of the time.
+        let primitive = primitives[i];
+        primitives[i] = primitives[left];
+        primitives[left] = primitive;
+        left += usize::from(is_left(&primitive));
     }
     left
 }
