@@ -36,11 +36,13 @@ fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64
     let floor = BETA * (1.0 - ratio.powf(GAMMA));
     let (mut order, mut grid) = Grid::new(candidates, reach);
     let count = order.len();
+    // Enough for what is left of the grid later, too.
+    let mut room = grid.room();
     let weights: Vec<f64> = (0..count)
         .into_par_iter()
         .with_min_len(4096)
         .map_init(
-            || grid.room(),
+            || room.clone(),
             |room, i| {
                 let weight = grid.near(i, room).iter().fold(0.0, |sum, near| sum + crowding(near.squared, floor));
                 // The point itself is no neighbour.
@@ -57,7 +59,7 @@ fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64
     while surplus > count / SHARE_IN_ORDER {
         // No more points than the surplus are more crowded than this, and removals only make it fewer.
         let Some(limit) = nth_largest_weight(&grid.points, surplus) else { break };
-        let removed = grid.remove_above(limit, floor);
+        let removed = grid.remove_above(limit, floor, &mut room);
         if removed == 0 {
             break;
         }
@@ -65,7 +67,6 @@ fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64
         grid.compact(&mut order);
     }
     let mut queue = Queue::new(&grid.points);
-    let mut room = grid.room();
     for _ in 0..surplus {
         let Some(i) = queue.pop_most_crowded(&grid.points) else { break };
         let near = grid.near(i as usize, &mut room);
@@ -295,10 +296,9 @@ impl Grid {
     /// The result is that of removing them in the order of their weights. Weights only ever fall, and fall only where a
     /// neighbour goes; so a point with no more crowded neighbour goes before all of them, whatever happens elsewhere. The
     /// points are visited where they lie, and each waits for its more crowded neighbours: all is near in memory.
-    fn remove_above(&mut self, limit: f64, floor: f64) -> usize {
+    fn remove_above(&mut self, limit: f64, floor: f64, room: &mut [Near]) -> usize {
         let mut removed = 0;
         let mut waiting = Vec::new();
-        let mut room = self.room();
         for start in 0..self.points.len() {
             waiting.push(start);
             while let Some(&i) = waiting.last() {
@@ -307,7 +307,7 @@ impl Grid {
                     waiting.pop();
                     continue;
                 }
-                let near = self.near(i, &mut room);
+                let near = self.near(i, room);
                 // Of equal ones the lowest number counts as more crowded.
                 let mut most = (weight, i);
                 for point in near.iter().map(|near| near.point as usize) {
