@@ -22,37 +22,15 @@ pub(super) fn score(
     progress: &dyn Progress,
 ) -> Result<SurfaceScores> {
     let steps = Steps::new(progress, "scoring the surface", 4);
-    let mut warnings = Vec::new();
-    let gt_points = sample_poisson_disk(&truth.mesh, options.points, options.truth_seed());
+    // Choosing points is work for one thread: the two surfaces get theirs side by side.
+    let (gt_points, pred) = rayon::join(
+        || sample_poisson_disk(&truth.mesh, options.points, options.truth_seed()),
+        || PredictionPoints::of(prediction, truth, name, options, &steps),
+    );
     if gt_points.is_empty() {
         return Err(InputError::new(&truth.mesh_path, "the ground truth has no surface").into());
     }
-    steps.step()?;
-
-    let registration = icp::register(&truth.mesh.vertices, &prediction.vertices);
-    let applied = registration.fitness > icp::APPLY_ABOVE;
-    let prediction = if applied { prediction.transformed(&registration.pred_from_gt.inverse()) } else { prediction };
-    let icp = describe(&registration, applied, truth);
-    steps.step()?;
-
-    let had_triangles = !prediction.triangles.is_empty();
-    let cropped = crop(prediction, &truth.visibility);
-    if cropped.vertices.is_empty() {
-        return Err(nothing_visible(name).into());
-    }
-    let pred_points = if cropped.triangles.is_empty() {
-        if had_triangles {
-            warnings.push("no triangle lies wholly inside the visible volume; its vertices are scored".to_owned());
-        } else {
-            warnings.push("the prediction is a point cloud; its points are scored".to_owned());
-        }
-        shuffled(cropped.vertices, options.points, options.prediction_seed())
-    } else {
-        sample_poisson_disk(&cropped, options.points, options.prediction_seed())
-    };
-    if pred_points.is_empty() {
-        return Err(InputError::new(name, "the triangles inside the visible volume have no area").into());
-    }
+    let PredictionPoints { icp, points: pred_points, warnings } = pred?;
     steps.step()?;
 
     let distances = Distances {
@@ -76,6 +54,53 @@ pub(super) fn score(
         warnings,
         seconds: 0.0,
     })
+}
+
+/// Points of a prediction in its place, and how they came about.
+struct PredictionPoints {
+    icp: Icp,
+    points: Vec<Point3<f64>>,
+    warnings: Vec<String>,
+}
+
+impl PredictionPoints {
+    fn of(
+        prediction: TriangleMesh,
+        truth: &SurfaceTruth,
+        name: &Path,
+        options: &SurfaceOptions,
+        steps: &Steps,
+    ) -> Result<Self> {
+        let registration = icp::register(&truth.mesh.vertices, &prediction.vertices);
+        let applied = registration.fitness > icp::APPLY_ABOVE;
+        let prediction =
+            if applied { prediction.transformed(&registration.pred_from_gt.inverse()) } else { prediction };
+        let icp = describe(&registration, applied, truth);
+        steps.step()?;
+
+        let had_triangles = !prediction.triangles.is_empty();
+        let cropped = crop(prediction, &truth.visibility);
+        if cropped.vertices.is_empty() {
+            return Err(nothing_visible(name).into());
+        }
+        steps.step()?;
+
+        let mut warnings = Vec::new();
+        let points = if cropped.triangles.is_empty() {
+            if had_triangles {
+                warnings.push("no triangle lies wholly inside the visible volume; its vertices are scored".to_owned());
+            } else {
+                warnings.push("the prediction is a point cloud; its points are scored".to_owned());
+            }
+            shuffled(cropped.vertices, options.points, options.prediction_seed())
+        } else {
+            sample_poisson_disk(&cropped, options.points, options.prediction_seed())
+        };
+        if points.is_empty() {
+            return Err(InputError::new(name, "the triangles inside the visible volume have no area").into());
+        }
+        Ok(Self { icp, points, warnings })
+    }
 }
 
 /// What the alignment found, in numbers for people.
