@@ -27,8 +27,8 @@
 //! A step is cut into a fixed number of groups of rays. Each has its own random numbers, and their sums are added in
 //! order, so a run's result depends on the seed and the machine's instruction set, not on the number of threads.
 //!
-//! Limits: pinhole cameras without distortion; one exposure for all photographs; the GPU path is another crate's,
-//! which fills [`device::Device`].
+//! Limits: pinhole cameras without distortion; one exposure for all photographs; no GPU path yet ([`device::Device`] is
+//! where one will be chosen).
 
 #![allow(clippy::too_many_arguments, reason = "kernels take buffers with their strides")]
 

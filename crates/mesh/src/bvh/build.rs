@@ -318,10 +318,8 @@ fn partition(primitives: &mut [Primitive], is_left: impl Fn(&Primitive) -> bool)
     let mut left = 0;
     for i in 0..primitives.len() {
         // Always exchanged, as it costs less than a guess that is wrong half of the time.
-        let primitive = primitives[i];
-        primitives[i] = primitives[left];
-        primitives[left] = primitive;
-        left += usize::from(is_left(&primitive));
+        primitives.swap(i, left);
+        left += usize::from(is_left(&primitives[left]));
     }
     left
 }
