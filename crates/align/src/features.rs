@@ -54,7 +54,7 @@ pub fn detect_features(photograph: &RgbImage, options: &FeatureOptions) -> Vec<F
         let scales = Octave::new(base);
         let mut found = extrema(&scales, options);
         if options.most > 0 {
-            // Those that the others of their own octave outdo are not kept anyway; describing costs more than finding.
+            // Those that enough others of their own octave outdo are not kept anyway, and need no description.
             found.sort_by(|a, b| b.contrast.total_cmp(&a.contrast));
             found.truncate(options.most);
         }
@@ -220,8 +220,8 @@ fn window(radius: isize, offset: f32, sigma: f32) -> Vec<f32> {
     (-radius..=radius).map(|d| (-((d as f32 + offset) / sigma).powi(2) / 2.0).exp()).collect()
 }
 
-/// The direction of a gradient, radians from x towards y, in [0, 2 pi]; within 1e-5 of `atan2`, at a fifth of its time
-/// (a minimax polynomial of the arc tangent up to 45 degrees, and reflections).
+/// The direction of a gradient, radians from x towards y, in [0, 2 pi]; within 1e-5 of `atan2` (a minimax
+/// polynomial of the arc tangent up to 45 degrees, and reflections).
 fn direction(x: f32, y: f32) -> f32 {
     use std::f32::consts::{FRAC_PI_2, PI, TAU};
     const ODD: [f32; 6] = [0.999_977_26, -0.332_623_47, 0.193_543_46, -0.116_432_87, 0.052_653_32, -0.011_721_2];

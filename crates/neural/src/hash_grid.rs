@@ -36,17 +36,13 @@ pub struct HashGridOptions {
     pub finest: usize,
 }
 
-/// One level of an encoding.
 #[derive(Debug, Clone, Copy)]
-pub struct Level {
-    /// Cells a side.
-    pub cells: u32,
+struct Level {
+    cells: u32,
     /// Offset of the first feature.
-    pub offset: usize,
-    /// Entries, `features` numbers each.
-    pub entries: u32,
-    /// Whether each corner has an entry of its own.
-    pub dense: bool,
+    offset: usize,
+    entries: u32,
+    dense: bool,
 }
 
 /// The levels of an encoding, worked out.
@@ -232,14 +228,18 @@ impl Columns {
 /// Positions whose cells are found before any of their corners is read: the reads, which are slow, then overlap.
 const AHEAD: usize = 16;
 
-/// The cells of up to [`AHEAD`] positions.
+/// Calls `each` with the number and the cell of every position.
 #[inline(always)]
-fn cells_of(level: &Level, positions: &[[f32; 3]]) -> [Cell; AHEAD] {
+fn for_each_cell(level: &Level, positions: &[[f32; 3]], mut each: impl FnMut(usize, &Cell)) {
     let mut cells = [Cell::ZERO; AHEAD];
-    for (cell, p) in cells.iter_mut().zip(positions) {
-        *cell = level.cell(*p);
+    for (block, positions) in positions.chunks(AHEAD).enumerate() {
+        for (cell, p) in cells.iter_mut().zip(positions) {
+            *cell = level.cell(*p);
+        }
+        for (j, cell) in cells[..positions.len()].iter().enumerate() {
+            each(block * AHEAD + j, cell);
+        }
     }
-    cells
 }
 
 // Each kernel works on one level for all positions, so that its part of the table stays in the cache.
@@ -252,13 +252,9 @@ fn encode_level_body<const F: usize>(
     out: &mut [f32],
     at: Columns,
 ) {
-    for (block, block_positions) in positions.chunks(AHEAD).enumerate() {
-        let cells = cells_of(&level, block_positions);
-        for (j, cell) in cells.iter().enumerate().take(block_positions.len()) {
-            let i = block * AHEAD + j;
-            at.of_mut::<F>(out, i).copy_from_slice(&cell.blend::<F>(table, &cell.weights()));
-        }
-    }
+    for_each_cell(&level, positions, |i, cell| {
+        at.of_mut::<F>(out, i).copy_from_slice(&cell.blend::<F>(table, &cell.weights()));
+    });
 }
 dispatched! {
     fn encode_level<const F: usize>(level: Level, table: &[f32], positions: &[[f32; 3]], out: &mut [f32], at: Columns)
@@ -275,14 +271,10 @@ fn tangent_level_body<const F: usize>(
     at: Columns,
 ) {
     let scale = level.cells as f32;
-    for (block, block_positions) in positions.chunks(AHEAD).enumerate() {
-        let cells = cells_of(&level, block_positions);
-        for (j, cell) in cells.iter().enumerate().take(block_positions.len()) {
-            let i = block * AHEAD + j;
-            let factors = cell.weight_tangents(d_n[i], scale);
-            at.of_mut::<F>(out, i).copy_from_slice(&cell.blend::<F>(table, &factors));
-        }
-    }
+    for_each_cell(&level, positions, |i, cell| {
+        let factors = cell.weight_tangents(d_n[i], scale);
+        at.of_mut::<F>(out, i).copy_from_slice(&cell.blend::<F>(table, &factors));
+    });
 }
 dispatched! {
     fn tangent_level<const F: usize>(level: Level, table: &[f32], positions: &[[f32; 3]], d_n: &[[f32; 3]],
@@ -299,17 +291,13 @@ fn gradient_level_body<const F: usize>(
     at: Columns,
 ) {
     let scale = level.cells as f32;
-    for (block, block_positions) in positions.chunks(AHEAD).enumerate() {
-        let cells = cells_of(&level, block_positions);
-        for (j, cell) in cells.iter().enumerate().take(block_positions.len()) {
-            let i = block * AHEAD + j;
-            let dots = cell.dots::<F>(table, at.of::<F>(g, i));
-            let gradients = cell.weight_gradients();
-            for d in 0..3 {
-                normals[i][d] += scale * dot8(&gradients[d], &dots);
-            }
+    for_each_cell(&level, positions, |i, cell| {
+        let dots = cell.dots::<F>(table, at.of::<F>(g, i));
+        let gradients = cell.weight_gradients();
+        for d in 0..3 {
+            normals[i][d] += scale * dot8(&gradients[d], &dots);
         }
-    }
+    });
 }
 dispatched! {
     fn gradient_level<const F: usize>(level: Level, table: &[f32], positions: &[[f32; 3]], g: &[f32],
@@ -327,17 +315,13 @@ fn second_level_body<const F: usize>(
     at: Columns,
 ) {
     let scale = (level.cells as f32) * (level.cells as f32);
-    for (block, block_positions) in positions.chunks(AHEAD).enumerate() {
-        let cells = cells_of(&level, block_positions);
-        for (j, cell) in cells.iter().enumerate().take(block_positions.len()) {
-            let i = block * AHEAD + j;
-            let dots = cell.dots::<F>(table, at.of::<F>(g, i));
-            let seconds = cell.weight_seconds(d_n[i]);
-            for d in 0..3 {
-                to[i][d] += scale * dot8(&seconds[d], &dots);
-            }
+    for_each_cell(&level, positions, |i, cell| {
+        let dots = cell.dots::<F>(table, at.of::<F>(g, i));
+        let seconds = cell.weight_seconds(d_n[i]);
+        for d in 0..3 {
+            to[i][d] += scale * dot8(&seconds[d], &dots);
         }
-    }
+    });
 }
 dispatched! {
     fn second_level<const F: usize>(level: Level, table: &[f32], positions: &[[f32; 3]], g: &[f32], d_n: &[[f32; 3]],
@@ -347,34 +331,30 @@ dispatched! {
 #[inline(always)]
 fn scatter_level_body<const F: usize>(level: Level, batch: &Scatter<'_>, grads: &mut [f32], at: Columns) {
     let scale = level.cells as f32;
-    for (block, block_positions) in batch.positions.chunks(AHEAD).enumerate() {
-        let cells = cells_of(&level, block_positions);
-        for (j, cell) in cells.iter().enumerate().take(block_positions.len()) {
-            let i = block * AHEAD + j;
-            let d_e = at.of::<F>(batch.d_features, i);
-            let weights = cell.weights();
-            match batch.gradient {
-                None => {
-                    for c in 0..8 {
-                        let to = &mut grads[cell.corners[c] as usize * F..][..F];
-                        for f in 0..F {
-                            to[f] += weights[c] * d_e[f];
-                        }
+    for_each_cell(&level, batch.positions, |i, cell| {
+        let d_e = at.of::<F>(batch.d_features, i);
+        let weights = cell.weights();
+        match batch.gradient {
+            None => {
+                for c in 0..8 {
+                    let to = &mut grads[cell.corners[c] as usize * F..][..F];
+                    for f in 0..F {
+                        to[f] += weights[c] * d_e[f];
                     }
                 }
-                Some((g, d_n)) => {
-                    let g = at.of::<F>(g, i);
-                    let tangents = cell.weight_tangents(d_n[i], scale);
-                    for c in 0..8 {
-                        let to = &mut grads[cell.corners[c] as usize * F..][..F];
-                        for f in 0..F {
-                            to[f] += weights[c] * d_e[f] + tangents[c] * g[f];
-                        }
+            }
+            Some((g, d_n)) => {
+                let g = at.of::<F>(g, i);
+                let tangents = cell.weight_tangents(d_n[i], scale);
+                for c in 0..8 {
+                    let to = &mut grads[cell.corners[c] as usize * F..][..F];
+                    for f in 0..F {
+                        to[f] += weights[c] * d_e[f] + tangents[c] * g[f];
                     }
                 }
             }
         }
-    }
+    });
 }
 dispatched! {
     fn scatter_level<const F: usize>(level: Level, batch: &Scatter<'_>, grads: &mut [f32], at: Columns) = scatter_level_body
@@ -425,16 +405,6 @@ impl HashGrid {
     /// Features of all levels together.
     pub fn width(&self) -> usize {
         self.options.levels * self.options.features
-    }
-
-    /// The sizes it was made from.
-    pub fn options(&self) -> &HashGridOptions {
-        &self.options
-    }
-
-    /// The levels, coarsest first.
-    pub fn layout(&self) -> &[Level] {
-        &self.levels
     }
 
     /// Number of levels.

@@ -11,7 +11,6 @@ use serde::{Deserialize, Serialize};
 use crate::camera_path::{CameraPath, new_views};
 use crate::cameras::{CameraOptions, CameraResiduals};
 use crate::dataset::{DataOptions, RayDataset, View};
-use crate::device::Device;
 use crate::dvgo::{Dvgo, DvgoOptions};
 use crate::extract::{SurfaceOptions, extract};
 use crate::model::Model;
@@ -110,7 +109,7 @@ impl FieldOptions {
         self
     }
 
-    /// The untrained model, for the processor.
+    /// The untrained model.
     pub fn model(&self, data: &RayDataset) -> Box<dyn Model> {
         match &self.method {
             Method::Nerf(options) => Box::new(Nerf::new(options.clone(), data)),
@@ -121,8 +120,8 @@ impl FieldOptions {
         }
     }
 
-    fn train(&self, data: &RayDataset, device: &dyn Device, progress: &dyn Progress) -> Result<Trained> {
-        let mut model = device.model(self, data)?;
+    fn train(&self, data: &RayDataset, progress: &dyn Progress) -> Result<Trained> {
+        let mut model = self.model(data);
         let mut cameras = CameraResiduals::new(&self.cameras, data);
         let json =
             serde_json::to_value((&self.method, &self.cameras)).expect("options are plain data with string keys");
@@ -147,8 +146,6 @@ pub struct ReconstructSummary {
     pub region: Region,
     /// Photographs used.
     pub images: usize,
-    /// What trained.
-    pub device: String,
     /// The training.
     pub training: TrainSummary,
     /// Triangles of the mesh.
@@ -161,18 +158,17 @@ pub struct ReconstructSummary {
 /// cameras were corrected, their poses are written to `cameras_to/pose/`.
 ///
 /// # Errors
-/// As [`RayDataset::open`], [`Device::model`], [`train`] and [`extract`].
+/// As [`RayDataset::open`], [`train`] and [`extract`].
 pub fn reconstruct(
     sequence: &Sequence,
     options: &FieldOptions,
-    device: &dyn Device,
     cameras_to: Option<&Path>,
     progress: &dyn Progress,
 ) -> Result<(TriangleMesh, ReconstructSummary)> {
     let all = DataOptions { hold_out_every: 0, ..options.data.clone() };
     let options = FieldOptions { data: all, ..options.clone() };
     let data = RayDataset::open(sequence, &options.data, progress)?;
-    let Trained { model, cameras, summary: training } = options.train(&data, device, progress)?;
+    let Trained { model, cameras, summary: training } = options.train(&data, progress)?;
     let mesh = extract(model.as_ref(), &data, &cameras, &options.surface, progress)?;
     if let Some(folder) = cameras_to.filter(|_| cameras.size().is_some()) {
         write_cameras(folder, &data, &cameras)?;
@@ -181,7 +177,6 @@ pub fn reconstruct(
         options,
         region: *data.region(),
         images: data.views().len(),
-        device: device.name(),
         training,
         triangles: mesh.triangles.len(),
         warnings: data.warnings().to_vec(),
@@ -218,8 +213,6 @@ pub struct SynthesizeSummary {
     pub options: FieldOptions,
     /// Where the object was taken to be (world frame).
     pub region: Region,
-    /// What trained.
-    pub device: String,
     /// The training.
     pub training: TrainSummary,
     /// Rendered views.
@@ -236,11 +229,10 @@ pub struct SynthesizeSummary {
 /// size as `reference/NNNNNN.png`, so that `eval views --gt OUT/reference --pred OUT` scores them; or others.
 ///
 /// # Errors
-/// As [`RayDataset::open`], [`Device::model`], [`train`], [`CameraPath`] and [`write_film`]; a picture cannot be written.
+/// As [`RayDataset::open`], [`train`], [`CameraPath`] and [`write_film`]; a picture cannot be written.
 pub fn synthesize(
     sequence: &Sequence,
     options: &FieldOptions,
-    device: &dyn Device,
     views: &Views,
     progress: &dyn Progress,
 ) -> Result<SynthesizeSummary> {
@@ -250,7 +242,7 @@ pub fn synthesize(
         CameraPath::HeldOut => Vec::new(),
         path => new_views(path, &data, sequence.image_size())?,
     };
-    let Trained { model, cameras, summary: training } = options.train(&data, device, progress)?;
+    let Trained { model, cameras, summary: training } = options.train(&data, progress)?;
     let mut per_image = Vec::new();
     let mut images = Vec::new();
     let held_out: Vec<_> = data.views().iter().enumerate().filter(|(_, v)| v.held_out && others.is_empty()).collect();
@@ -278,7 +270,6 @@ pub fn synthesize(
     Ok(SynthesizeSummary {
         options: options.clone(),
         region: *data.region(),
-        device: device.name(),
         training,
         images: held_out.len() + others.len(),
         psnr_db: (!per_image.is_empty()).then_some(mean),

@@ -5,7 +5,7 @@
 //! the point where less than a thousandth of the light is left are dropped, colours are composited
 //! ([`crate::composite`]), and the squared error is sent back.
 
-use mb_job::{Result, Rng, rng};
+use mb_job::{Rng, rng};
 use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -128,23 +128,19 @@ struct Task<'a> {
     move_cameras: bool,
 }
 
-/// A NeRF in training. Its state is open, for a device that trains it elsewhere.
+/// A NeRF in training.
 pub struct Nerf {
-    /// How it is trained.
-    pub options: NerfOptions,
-    /// Its sizes.
-    pub field: RadianceField,
-    /// What it has learned.
-    pub parameters: RadianceParameters,
-    /// Where matter may be.
-    pub occupancy: OccupancyGrid,
-    /// Running mean of the samples of a ray (one number).
-    pub samples_per_ray: Vec<f32>,
+    options: NerfOptions,
+    field: RadianceField,
+    parameters: RadianceParameters,
+    occupancy: OccupancyGrid,
+    /// Running mean of the samples of a ray.
+    samples_per_ray: Vec<f32>,
     groups: Vec<Group>,
 }
 
 /// Light below which the rest of a ray is dropped.
-pub const DARK: f32 = 1e-3;
+const DARK: f32 = 1e-3;
 
 impl Nerf {
     /// A NeRF at its start. Where fewer than two cameras look, nothing can be known and nothing is kept.
@@ -161,27 +157,6 @@ impl Nerf {
             field,
             parameters,
         }
-    }
-
-    /// Rays of each group of the next step.
-    pub fn rays_of_group(&self) -> usize {
-        let wanted = self.options.samples_per_step as f32 / self.samples_per_ray[0].max(1.0);
-        (wanted as usize / GROUPS).clamp(8, 1024)
-    }
-
-    /// Notes how many samples a step took on so many rays.
-    pub fn count_samples(&mut self, samples: usize, rays: usize) {
-        self.samples_per_ray[0] += 0.1 * (samples as f32 / rays as f32 - self.samples_per_ray[0]);
-    }
-
-    /// Which cells the `turn`-th refresh looks at: all of them in turns 1, 3, 7 and 15, so that empty space is left early.
-    pub fn looks_everywhere(turn: u64) -> bool {
-        turn < TURNS && (turn + 1).is_power_of_two()
-    }
-
-    /// The random numbers of a refresh.
-    pub fn occupancy_seed(&self) -> u64 {
-        self.options.seed ^ 0x6f63
     }
 
     /// Adds a ray's samples to the tile; `jitter` in 0..1 shifts them by a part of a step.
@@ -316,16 +291,16 @@ impl Nerf {
     /// A cell counts where a shortest step through it stops a hundredth of the light, or, while everything is thin,
     /// where it is denser than the mean (as in instant-ngp). After the first round a haze below four times the mean
     /// has to go, or a processor would spend most of its samples on it.
-    pub fn occupancy_threshold(&self, turn: u64) -> f32 {
+    fn occupancy_threshold(&self, turn: u64) -> f32 {
         let thin = self.occupancy.mean() * if turn < TURNS { 1.0 } else { 4.0 };
         thin.min(0.01 / self.options.step)
     }
 
-    /// The `turn`-th refresh.
+    /// The `turn`-th refresh. Turns 1, 3, 7, 15 look at every cell, so that empty space is left early.
     fn refresh_occupancy(&mut self, turn: u64) {
-        let (seed, all) = (self.occupancy_seed(), Self::looks_everywhere(turn));
+        let all = turn < TURNS && (turn + 1).is_power_of_two();
         let (field, parameters) = (&self.field, &self.parameters);
-        self.occupancy.update(seed, turn, all, CELL_MEMORY, |positions, out| {
+        self.occupancy.update(self.options.seed ^ 0x6f63, turn, all, CELL_MEMORY, |positions, out| {
             let mut worker = RadianceWorker::default();
             for tile in positions.chunks(TILE) {
                 field.density(parameters, tile, &mut worker);
@@ -345,8 +320,9 @@ impl Model for Nerf {
         self.options.iterations
     }
 
-    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
-        let rays = self.rays_of_group();
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport {
+        let wanted = self.options.samples_per_step as f32 / self.samples_per_ray[0].max(1.0);
+        let rays = (wanted as usize / GROUPS).clamp(8, 1024);
         let transposed = self.field.transpose(&self.parameters);
         let move_cameras = cameras.wants_gradients(step);
         let task = Task { data, cameras, transposed: &transposed, rays, move_cameras };
@@ -371,12 +347,12 @@ impl Model for Nerf {
         }
         self.groups = groups;
         self.parameters.step(self.options.learning_rate * factor, step + 1);
-        self.count_samples(samples, rays * GROUPS);
+        self.samples_per_ray[0] += 0.1 * (samples as f32 / n as f32 - self.samples_per_ray[0]);
         if (step + 1).is_multiple_of(self.options.occupancy_every) {
             self.refresh_occupancy((step + 1) / self.options.occupancy_every);
         }
         let loss = mse + f64::from(self.options.distortion) * distortion;
-        Ok(StepReport { loss, mse, rays: rays * GROUPS, samples })
+        StepReport { loss, mse, rays: rays * GROUPS, samples }
     }
 
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
@@ -443,7 +419,7 @@ impl Model for Nerf {
         all
     }
 
-    fn restored(&mut self, _step: u64) -> std::result::Result<(), String> {
+    fn restored(&mut self, _step: u64) -> Result<(), String> {
         let mut lengths: Vec<usize> = self.parameters.lengths();
         lengths.extend(self.occupancy.lengths());
         lengths.push(1);

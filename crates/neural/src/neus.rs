@@ -11,7 +11,7 @@
 //! fine), so that the shape settles before its details. All derivatives are exact ([`crate::sdf_field`],
 //! [`crate::neus_alpha`], [`crate::composite`]).
 
-use mb_job::{Result, Rng, rng};
+use mb_job::{Rng, rng};
 use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -538,7 +538,7 @@ impl Model for Neus {
         self.options.iterations
     }
 
-    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport {
         self.set_levels(step);
         let wanted = self.options.samples_per_step as f32 / self.samples_per_ray[0].max(1.0);
         let rays = (wanted as usize / GROUPS).clamp(8, 128);
@@ -581,7 +581,7 @@ impl Model for Neus {
         if (step + 1).is_multiple_of(self.options.occupancy_every) {
             self.refresh_cells((step + 1) / self.options.occupancy_every);
         }
-        Ok(StepReport { loss, mse, rays: rays * GROUPS, samples })
+        StepReport { loss, mse, rays: rays * GROUPS, samples }
     }
 
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
@@ -636,7 +636,7 @@ impl Model for Neus {
         all
     }
 
-    fn restored(&mut self, step: u64) -> std::result::Result<(), String> {
+    fn restored(&mut self, step: u64) -> Result<(), String> {
         let mut lengths = self.field.lengths();
         lengths.extend(self.outside_parameters.lengths());
         lengths.extend([1, 1, 1]);

@@ -114,58 +114,28 @@ impl OccupancyGrid {
         decay: f32,
         density: impl Fn(&[[f32; 3]], &mut Vec<f32>) + Sync,
     ) {
-        let (cells, positions) = self.points_of_turn(seed, turn, all);
-        let found: Vec<Vec<f32>> = positions
-            .par_chunks(PIECE)
-            .map(|positions| {
-                let mut found = Vec::with_capacity(positions.len());
-                density(positions, &mut found);
-                found
-            })
-            .collect();
-        self.remember(&cells, &found.concat(), decay);
-    }
-
-    /// The first half of [`Self::update`]: the cells that the turn looks at, and a random point of each.
-    pub fn points_of_turn(&self, seed: u64, turn: u64, all: bool) -> (Vec<u32>, Vec<[f32; 3]>) {
         let r = self.resolution;
         let offset = (turn % TURNS) as usize;
-        let pieces: Vec<(Vec<u32>, Vec<[f32; 3]>)> = self
-            .closed
-            .par_chunks(PIECE)
-            .enumerate()
-            .map(|(piece, closed)| {
-                let mut rng = rng(seed, turn.wrapping_mul(1 << 20) + piece as u64);
-                (0..closed.len())
-                    .filter(|i| !closed[*i] && (all || (piece * PIECE + i) % TURNS as usize == offset))
-                    .map(|i| {
-                        let i = piece * PIECE + i;
-                        let cell = [i % r, i / r % r, i / (r * r)];
-                        (i as u32, cell.map(|c| (c as f32 + rng.random::<f32>()) / r as f32))
-                    })
-                    .unzip()
-            })
-            .collect();
-        let mut all = (Vec::new(), Vec::new());
-        for (cells, points) in pieces {
-            all.0.extend(cells);
-            all.1.extend(points);
-        }
-        all
-    }
-
-    /// The second half of [`Self::update`]: what was found at the points.
-    pub fn remember(&mut self, cells: &[u32], found: &[f32], decay: f32) {
-        for (cell, found) in cells.iter().zip(found) {
-            let value = &mut self.values[*cell as usize];
-            let kept = if value.is_finite() { decay * *value } else { 0.0 };
-            *value = kept.max(*found);
-        }
-    }
-
-    /// Which cells are occupied, x fastest.
-    pub fn occupied(&self) -> &[bool] {
-        &self.occupied
+        self.values.par_chunks_mut(PIECE).enumerate().for_each(|(piece, values)| {
+            let mut rng = rng(seed, turn.wrapping_mul(1 << 20) + piece as u64);
+            let cells: Vec<usize> = (0..values.len())
+                .filter(|i| !self.closed[piece * PIECE + i])
+                .filter(|i| all || (piece * PIECE + i) % TURNS as usize == offset)
+                .collect();
+            let positions: Vec<[f32; 3]> = cells
+                .iter()
+                .map(|i| {
+                    let i = piece * PIECE + i;
+                    [i % r, i / r % r, i / (r * r)].map(|c| (c as f32 + rng.random::<f32>()) / r as f32)
+                })
+                .collect();
+            let mut found = Vec::with_capacity(cells.len());
+            density(&positions, &mut found);
+            for (i, density) in cells.into_iter().zip(found) {
+                let kept = if values[i].is_finite() { decay * values[i] } else { 0.0 };
+                values[i] = kept.max(density);
+            }
+        });
     }
 
     /// Mean of the open cells that have been looked at; infinite before the first look.

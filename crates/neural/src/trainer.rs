@@ -131,13 +131,10 @@ pub fn train(
     let mut what = format!("training {}", model.name());
     progress.report(&what, step as usize, total as usize);
     while step < total {
-        let report = model.step(data, cameras, step).map_err(|e| kept(e, run))?;
+        let report = model.step(data, cameras, step);
         step += 1;
         window.add(&report);
         let point_due = step.is_multiple_of(run.report_every.max(1)) || step == total;
-        if point_due {
-            model.fetch().map_err(|e| kept(e, run))?;
-        }
         if !report.loss.is_finite() || (point_due && !model.is_finite()) {
             return Err(diverged(step, "a number is no longer finite", run));
         }
@@ -167,18 +164,16 @@ pub fn train(
         }
         progress.report(&what, step as usize, total as usize);
         let stop = progress.stop_requested();
-        let due = |every: u64| step == total || step.is_multiple_of(every.max(1));
-        let checkpoint = run.checkpoint.as_ref().filter(|_| stop || due(run.checkpoint_every));
-        let previews = run.previews.as_ref().filter(|_| due(run.preview_every));
-        if checkpoint.is_some() || previews.is_some() {
-            model.fetch().map_err(|e| kept(e, run))?;
-        }
-        if let Some(path) = checkpoint {
+        if let Some(path) = &run.checkpoint
+            && (stop || step == total || step.is_multiple_of(run.checkpoint_every.max(1)))
+        {
             let mut buffers = model.buffers();
             buffers.extend(cameras.buffers());
             checkpoint::write(path, &header, step, &buffers)?;
         }
-        if let Some(folder) = previews {
+        if let Some(folder) = &run.previews
+            && (step == total || step.is_multiple_of(run.preview_every.max(1)))
+        {
             write_preview(folder, model, data, cameras, step)?;
         }
         if stop && step < total {
@@ -240,25 +235,13 @@ fn time(seconds: f64) -> String {
 }
 
 fn diverged(step: u64, why: &str, run: &RunOptions) -> Error {
-    Error::Failed(format!(
-        "training diverged at step {step}: {why}{}. Check the poses with `capture check`, or lower the learning rate",
-        last_good_state(run)
-    ))
-}
-
-/// The failure of a device, with what is left of the run.
-fn kept(error: Error, run: &RunOptions) -> Error {
-    match error {
-        Error::Failed(why) => Error::Failed(why + &last_good_state(run)),
-        other => other,
-    }
-}
-
-fn last_good_state(run: &RunOptions) -> String {
-    match &run.checkpoint {
+    let kept = match &run.checkpoint {
         Some(path) if path.exists() => format!("; {} holds the last good state", path.display()),
         _ => String::new(),
-    }
+    };
+    Error::Failed(format!(
+        "training diverged at step {step}: {why}{kept}. Check the poses with `capture check`, or lower the learning rate"
+    ))
 }
 
 #[derive(Debug, Default)]

@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 use clap::{Args, Subcommand};
 use mb_job::{Error, InputError, Result};
 use mb_neural::FieldOptions;
-use mb_neural::device::Processor;
 use mb_neural::results::write_beside;
 use mb_recon::{PoseSource, TsdfOptions, reconstruct_tsdf};
 
@@ -247,8 +246,7 @@ impl Field {
         }
         options.surface.cull &= !self.no_cull;
         let cameras = beside(&self.out, ".cameras");
-        let (mesh, summary) =
-            mb_neural::reconstruct(&self.sequence.open()?, &options, &Processor, Some(&cameras), terminal)?;
+        let (mesh, summary) = mb_neural::reconstruct(&self.sequence.open()?, &options, Some(&cameras), terminal)?;
         mb_mesh::write_mesh(&self.out, &mesh)?;
         write_beside(&beside(&self.out, ""), &summary, &summary.training.curve)?;
         self.training.finish(&self.out);

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 use mb_job::Result;
 use mb_neural::camera_path::CameraPath;
-use mb_neural::device::Processor;
 use mb_neural::results::write_beside;
 
 use super::SequenceArgument;
@@ -80,7 +79,7 @@ impl Views {
             film: self.film.clone(),
             frames_per_second: self.fps,
         };
-        let summary = mb_neural::synthesize(&self.sequence.open()?, &options, &Processor, &views, terminal)?;
+        let summary = mb_neural::synthesize(&self.sequence.open()?, &options, &views, terminal)?;
         write_beside(&run, &summary, &summary.training.curve)?;
         self.training.finish(&run);
         let mut text = format!("wrote {}: {} views", self.out.display(), summary.images);
