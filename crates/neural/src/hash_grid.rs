@@ -228,18 +228,21 @@ impl Columns {
 /// Positions whose cells are found before any of their corners is read: the reads, which are slow, then overlap.
 const AHEAD: usize = 16;
 
-/// Calls `each` with the number and the cell of every position.
-#[inline(always)]
-fn for_each_cell(level: &Level, positions: &[[f32; 3]], mut each: impl FnMut(usize, &Cell)) {
-    let mut cells = [Cell::ZERO; AHEAD];
-    for (block, positions) in positions.chunks(AHEAD).enumerate() {
-        for (cell, p) in cells.iter_mut().zip(positions) {
-            *cell = level.cell(*p);
+/// Runs a block for the number and the cell of every position. A function with a closure would have the closure compiled
+/// once, without the instruction set that the kernel around it is compiled for.
+macro_rules! for_each_cell {
+    ($level:expr, $positions:expr, |$i:ident, $cell:ident| $block:block) => {
+        let mut cells = [Cell::ZERO; AHEAD];
+        for (ahead, positions) in $positions.chunks(AHEAD).enumerate() {
+            for (cell, p) in cells.iter_mut().zip(positions) {
+                *cell = $level.cell(*p);
+            }
+            for (j, $cell) in cells[..positions.len()].iter().enumerate() {
+                let $i = ahead * AHEAD + j;
+                $block
+            }
         }
-        for (j, cell) in cells[..positions.len()].iter().enumerate() {
-            each(block * AHEAD + j, cell);
-        }
-    }
+    };
 }
 
 // Each kernel works on one level for all positions, so that its part of the table stays in the cache.
@@ -252,7 +255,7 @@ fn encode_level_body<const F: usize>(
     out: &mut [f32],
     at: Columns,
 ) {
-    for_each_cell(&level, positions, |i, cell| {
+    for_each_cell!(level, positions, |i, cell| {
         at.of_mut::<F>(out, i).copy_from_slice(&cell.blend::<F>(table, &cell.weights()));
     });
 }
@@ -271,7 +274,7 @@ fn tangent_level_body<const F: usize>(
     at: Columns,
 ) {
     let scale = level.cells as f32;
-    for_each_cell(&level, positions, |i, cell| {
+    for_each_cell!(level, positions, |i, cell| {
         let factors = cell.weight_tangents(d_n[i], scale);
         at.of_mut::<F>(out, i).copy_from_slice(&cell.blend::<F>(table, &factors));
     });
@@ -291,7 +294,7 @@ fn gradient_level_body<const F: usize>(
     at: Columns,
 ) {
     let scale = level.cells as f32;
-    for_each_cell(&level, positions, |i, cell| {
+    for_each_cell!(level, positions, |i, cell| {
         let dots = cell.dots::<F>(table, at.of::<F>(g, i));
         let gradients = cell.weight_gradients();
         for d in 0..3 {
@@ -315,7 +318,7 @@ fn second_level_body<const F: usize>(
     at: Columns,
 ) {
     let scale = (level.cells as f32) * (level.cells as f32);
-    for_each_cell(&level, positions, |i, cell| {
+    for_each_cell!(level, positions, |i, cell| {
         let dots = cell.dots::<F>(table, at.of::<F>(g, i));
         let seconds = cell.weight_seconds(d_n[i]);
         for d in 0..3 {
@@ -331,7 +334,7 @@ dispatched! {
 #[inline(always)]
 fn scatter_level_body<const F: usize>(level: Level, batch: &Scatter<'_>, grads: &mut [f32], at: Columns) {
     let scale = level.cells as f32;
-    for_each_cell(&level, batch.positions, |i, cell| {
+    for_each_cell!(level, batch.positions, |i, cell| {
         let d_e = at.of::<F>(batch.d_features, i);
         let weights = cell.weights();
         match batch.gradient {
