@@ -47,6 +47,15 @@ fn the_number_of_bricks_is_kept() {
 }
 
 #[test]
+fn few_bricks_find_one_of_the_styles_that_they_suffice_for() {
+    // The styles drawn first fail here again and again.
+    for seed in [329, 331] {
+        let options = RandomOptions { bricks: 25, seed, ..RandomOptions::default() };
+        assert_eq!(random_model(&options, 0).unwrap().summary.parts, 25);
+    }
+}
+
+#[test]
 fn every_style_is_built_where_it_is_asked_for() {
     for style in Style::ALL {
         let profile = RandomProfile { styles: [(style, 1.0)].into(), ..RandomProfile::default() };

@@ -33,7 +33,8 @@ pub use summary::{BatchSummary, MostAlike, RandomSummary, Spread};
 
 /// How often a model is built anew before giving up.
 const ATTEMPTS: u64 = 200;
-/// Attempts at one style before another is drawn: styles that often fail would be rare otherwise.
+/// Attempts at one style before another is drawn: styles that often fail would be rare otherwise. Styles that failed so
+/// often are drawn again only when all have: few bricks are enough for few styles.
 const PATIENCE: u64 = 20;
 /// How often an attempt is built larger or smaller to come near the wanted number of bricks.
 const FITTINGS: usize = 6;
@@ -127,11 +128,17 @@ fn prepare(options: &RandomOptions) -> Result<PartSet> {
 /// The first sound model from attempt number `first` on, and the number of its attempt.
 fn build_until_sound(options: &RandomOptions, parts: &PartSet, index: usize, first: u64) -> Result<(RandomModel, u64)> {
     let mut style = Style::Sculpture;
+    let mut untried = Vec::new();
     for attempt in first..ATTEMPTS {
         // One stream for each attempt at each model.
         let mut rng = rng(options.seed, index as u64 * ATTEMPTS + attempt);
         if attempt == first || attempt % PATIENCE == 0 {
-            style = *draw(&mut rng, options.profile.styles.iter().map(|(style, &weight)| (style, weight)));
+            if untried.is_empty() {
+                let styles = options.profile.styles.iter().filter(|(_, weight)| **weight > 0.0);
+                untried.extend(styles.map(|(style, weight)| (*style, *weight)));
+            }
+            let drawn = draw(&mut rng, untried.iter().enumerate().map(|(at, (_, weight))| (at, *weight)));
+            style = untried.swap_remove(drawn).0;
         }
         let Some(build) = build_one(options, parts, style, &mut rng) else { continue };
         let description = format!("Random model {index} (seed {})", options.seed);
