@@ -35,10 +35,13 @@ fn main() -> ExitCode {
     }
 }
 
+/// GPU kernels are tested wherever there is a Vulkan device, a software one included.
+const GPU: &str = "--features=mb-gpu/wgpu";
+
 fn ci(root: &Path) -> Result<(), String> {
     cargo(root, &["fmt", "--all", "--check"], &[])?;
     tidy_all(root)?;
-    cargo(root, &["clippy", "--workspace", "--all-targets", "--quiet", "--", "-D", "warnings"], &[])?;
+    cargo(root, &["clippy", "--workspace", "--all-targets", GPU, "--quiet", "--", "-D", "warnings"], &[])?;
     test(root)?;
     cargo(root, &["doc", "--workspace", "--no-deps", "--quiet"], &[("RUSTDOCFLAGS", "-D warnings")])
 }
@@ -47,7 +50,8 @@ fn ci(root: &Path) -> Result<(), String> {
 fn test(root: &Path) -> Result<(), String> {
     let log = root.join("target").join(format!("skipped-{}.log", std::process::id()));
     let _ = std::fs::remove_file(&log);
-    let run = cargo(root, &["test", "--workspace", "--quiet"], &[("MOBILEBRICK_SKIP_LOG", &log.to_string_lossy())]);
+    let run =
+        cargo(root, &["test", "--workspace", GPU, "--quiet"], &[("MOBILEBRICK_SKIP_LOG", &log.to_string_lossy())]);
     let skipped = std::fs::read_to_string(&log).unwrap_or_default();
     let _ = std::fs::remove_file(&log);
     match skipped.lines().count() {

@@ -5,7 +5,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::{HumanDuration, MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use mb_job::Progress;
 
 static STOP: AtomicBool = AtomicBool::new(false);
@@ -64,6 +64,9 @@ impl Progress for Terminal {
             let style = ProgressStyle::with_template("{msg:28} {wide_bar} {pos}/{len} {elapsed} left {eta}")
                 .unwrap_or_else(|_| ProgressStyle::default_bar());
             let bar = self.bars.add(ProgressBar::new(total as u64).with_style(style).with_message(what.to_owned()));
+            // What an earlier run did took no time of this one.
+            bar.set_position(done as u64);
+            bar.reset_eta();
             Stage { bar, last_line: Instant::now() }
         });
         stage.bar.set_length(total as u64);
@@ -71,11 +74,19 @@ impl Progress for Terminal {
         // A log file has no bars: one line every ten seconds instead.
         if self.bars.is_hidden() && !self.quiet && stage.last_line.elapsed() > Duration::from_secs(10) {
             stage.last_line = Instant::now();
-            eprintln!("{what}: {done} of {total}, about {} s left", stage.bar.eta().as_secs());
+            let left = HumanDuration(stage.bar.eta());
+            eprintln!("{}: {done} of {total}, about {left} left", stage.bar.message());
         }
         if done >= total {
             stage.bar.finish_and_clear();
             stages.remove(what);
+        }
+    }
+
+    fn note(&self, what: &str, note: &str) {
+        let stages = self.stages.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        if let Some(stage) = stages.get(what) {
+            stage.bar.set_message(format!("{what}: {note}"));
         }
     }
 

@@ -9,6 +9,9 @@ pub trait Progress: Sync {
     /// `done` of `total` steps of the stage `what` are finished.
     fn report(&self, what: &str, done: usize, total: usize);
 
+    /// How the stage `what` is doing, in a few words; the next note replaces it.
+    fn note(&self, _what: &str, _note: &str) {}
+
     /// Whether the person asked for a stop.
     fn stop_requested(&self) -> bool;
 }

@@ -39,10 +39,11 @@ fn quick_psnr_db(model: &dyn Model, data: &RayDataset, cameras: &CameraResiduals
                 (0..view.size().pixels()).step_by(61).map(|i| (i % view.size().width, i / view.size().width)).collect();
             let rays: Vec<_> = pixels.iter().map(|(x, y)| cameras.ray(view, *index, [*x as f32, *y as f32])).collect();
             let colors = model.render(&rays);
+            let shown = view.shown(model.only_object());
             let squared: f64 = colors
                 .iter()
                 .zip(&pixels)
-                .flat_map(|(c, p)| c.iter().zip(view.rgb[*p]).map(|(a, b)| f64::from(a - f32::from(b) / 255.0).powi(2)))
+                .flat_map(|(c, p)| c.iter().zip(shown[*p]).map(|(a, b)| f64::from(a - f32::from(b) / 255.0).powi(2)))
                 .sum();
             psnr_db(squared / (3 * pixels.len()) as f64)
         })
@@ -81,7 +82,7 @@ fn main() {
     let every = (steps / 20).max(1);
     for step in 0..steps {
         let (clock, cpu_clock) = (Instant::now(), ProcessTime::now());
-        let report = model.step(&data, &mut cameras, step);
+        let report = model.step(&data, &mut cameras, step).expect("a step");
         wall += clock.elapsed().as_secs_f64();
         cpu += cpu_clock.elapsed().as_secs_f64();
         mse += report.mse;
@@ -107,11 +108,16 @@ fn main() {
     let held_out: Vec<_> = data.views().iter().enumerate().filter(|(_, v)| v.held_out).collect();
     for (index, view) in &held_out {
         let image = render_view(model.as_ref(), view, *index, &cameras);
-        sum += image_psnr_db(&image, &view.rgb);
+        let shown = view.shown(model.only_object());
+        sum += image_psnr_db(&image, &shown);
         let size = mb_geometry::ImageSize::new(2 * view.size().width, view.size().height);
-        let pair = Image::from_fn(size, |x, y| {
-            if x < view.size().width { image[(x, y)] } else { view.rgb[(x - view.size().width, y)] }
-        });
+        let pair =
+            Image::from_fn(
+                size,
+                |x, y| {
+                    if x < view.size().width { image[(x, y)] } else { shown[(x - view.size().width, y)] }
+                },
+            );
         mb_image::write_rgb_png(std::path::Path::new(out).join(format!("{}.png", view.frame)), &pair)
             .expect("a picture is written");
     }

@@ -3,6 +3,8 @@
 //! Images are read once, reduced by area averaging to the working size, and kept at 8 bits a channel: 60 frames at
 //! 480 x 360 take 31 MB. Every frame has its own intrinsics. Every eighth frame is held out for scoring.
 
+use std::borrow::Cow;
+
 use mb_capture::{Alignment, Frame, FrameId, Sequence};
 use mb_geometry::{Camera, ImageSize, Intrinsics, Rigid3, World};
 use mb_image::{Image, RgbImage};
@@ -143,6 +145,18 @@ impl View {
     /// Width and height at working size.
     pub fn size(&self) -> ImageSize {
         self.rgb.size()
+    }
+
+    /// What a model is compared with: the photograph, or, of `only_object`, the object before black. A photograph without
+    /// a mask is shown whole.
+    pub fn shown(&self, only_object: bool) -> Cow<'_, RgbImage> {
+        match self.mask.as_ref().filter(|_| only_object) {
+            Some(mask) => Cow::Owned(Image::from_fn(self.size(), |x, y| {
+                let covered = f32::from(mask[(x, y)]) / 255.0;
+                self.rgb[(x, y)].map(|c| (f32::from(c) * covered).round() as u8)
+            })),
+            None => Cow::Borrowed(&self.rgb),
+        }
     }
 
     fn target(&self, view: usize, x: usize, y: usize, cameras: &CameraResiduals) -> TargetRay {

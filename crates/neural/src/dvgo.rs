@@ -12,7 +12,7 @@
 //! Without, it is all of contracted space ([`crate::contraction`]), with steps that grow with distance, as its authors'
 //! later code has it for open scenes.
 
-use mb_job::{Rng, rng};
+use mb_job::{Result, Rng, rng};
 use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -522,11 +522,15 @@ impl Model for Dvgo {
         "dvgo"
     }
 
+    fn only_object(&self) -> bool {
+        self.with_masks
+    }
+
     fn iterations(&self) -> u64 {
         self.options.coarse.iterations + self.options.fine.iterations
     }
 
-    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport {
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
         let coarse = self.options.coarse.iterations;
         if step >= coarse {
             if !self.is_fine() {
@@ -568,7 +572,7 @@ impl Model for Dvgo {
             samples: groups.iter().map(|g| g.marched).sum(),
         };
         self.groups = groups;
-        report
+        Ok(report)
     }
 
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
@@ -624,7 +628,7 @@ impl Model for Dvgo {
         all
     }
 
-    fn restored(&mut self, _step: u64) -> Result<(), String> {
+    fn restored(&mut self, _step: u64) -> std::result::Result<(), String> {
         let wrong = || "the checkpoint belongs to a run with other options".to_owned();
         let [fine, l0, l1, l2, h0, h1, h2, nx, ny, nz] = *self.layout.as_slice() else { return Err(wrong()) };
         let size = [nx, ny, nz].map(|n| n as usize);

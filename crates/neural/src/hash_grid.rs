@@ -36,13 +36,17 @@ pub struct HashGridOptions {
     pub finest: usize,
 }
 
+/// One level of an encoding.
 #[derive(Debug, Clone, Copy)]
-struct Level {
-    cells: u32,
+pub struct Level {
+    /// Cells a side.
+    pub cells: u32,
     /// Offset of the first feature.
-    offset: usize,
-    entries: u32,
-    dense: bool,
+    pub offset: usize,
+    /// Entries, `features` numbers each.
+    pub entries: u32,
+    /// Whether each corner has an entry of its own.
+    pub dense: bool,
 }
 
 /// The levels of an encoding, worked out.
@@ -408,6 +412,16 @@ impl HashGrid {
     /// Features of all levels together.
     pub fn width(&self) -> usize {
         self.options.levels * self.options.features
+    }
+
+    /// The sizes it was made from.
+    pub fn options(&self) -> &HashGridOptions {
+        &self.options
+    }
+
+    /// The levels, coarsest first.
+    pub fn layout(&self) -> &[Level] {
+        &self.levels
     }
 
     /// Number of levels.

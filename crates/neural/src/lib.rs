@@ -1,14 +1,14 @@
-//! Learned scene representations of one capture, trained on the processor with kernels of our own.
+//! Learned scene representations of one capture, trained with kernels of our own.
 //!
 //! In: a [`mb_capture::Sequence`]. Out: a mesh ([`reconstruct`]) or pictures of the held-out views ([`synthesize`]), in
 //! the sequence's metric world frame. [`FieldOptions`] says which method (`nerf`, `dvgo`, `neus`) and how.
 //!
 //! ```no_run
 //! # fn main() -> mb_job::Result<()> {
-//! use mb_neural::{FieldOptions, reconstruct};
+//! use mb_neural::{FieldOptions, device::Processor, reconstruct};
 //! let sequence = mb_capture::Sequence::open("castle")?;
 //! let options = FieldOptions::preset("neus", "fast", 0).expect("a known method");
-//! let (mesh, summary) = reconstruct(&sequence, &options, None, &mb_job::Silent)?;
+//! let (mesh, summary) = reconstruct(&sequence, &options, &Processor, None, &mb_job::Silent)?;
 //! println!("{} triangles after {:.0} s", mesh.triangles.len(), summary.training.seconds);
 //! # Ok(())
 //! # }
@@ -27,7 +27,8 @@
 //! A step is cut into a fixed number of groups of rays. Each has its own random numbers, and their sums are added in
 //! order, so a run's result depends on the seed and the machine's instruction set, not on the number of threads.
 //!
-//! Limits: pinhole cameras without distortion; one exposure for all photographs; no GPU path yet.
+//! Limits: pinhole cameras without distortion; one exposure for all photographs; the GPU path is another crate's,
+//! which fills [`device::Device`].
 
 #![allow(clippy::too_many_arguments, reason = "kernels take buffers with their strides")]
 
@@ -39,6 +40,7 @@ pub mod composite;
 pub mod contraction;
 pub mod dataset;
 pub mod dense_grid;
+pub mod device;
 pub mod dvgo;
 pub mod encoding;
 pub mod extract;

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::camera_path::{CameraPath, new_views};
 use crate::cameras::{CameraOptions, CameraResiduals};
 use crate::dataset::{DataOptions, RayDataset, View};
+use crate::device::Device;
 use crate::dvgo::{Dvgo, DvgoOptions};
 use crate::extract::{SurfaceOptions, extract};
 use crate::model::Model;
@@ -109,7 +110,7 @@ impl FieldOptions {
         self
     }
 
-    /// The untrained model.
+    /// The untrained model, for the processor.
     pub fn model(&self, data: &RayDataset) -> Box<dyn Model> {
         match &self.method {
             Method::Nerf(options) => Box::new(Nerf::new(options.clone(), data)),
@@ -120,8 +121,8 @@ impl FieldOptions {
         }
     }
 
-    fn train(&self, data: &RayDataset, progress: &dyn Progress) -> Result<Trained> {
-        let mut model = self.model(data);
+    fn train(&self, data: &RayDataset, device: &dyn Device, progress: &dyn Progress) -> Result<Trained> {
+        let mut model = device.model(self, data)?;
         let mut cameras = CameraResiduals::new(&self.cameras, data);
         let json =
             serde_json::to_value((&self.method, &self.cameras)).expect("options are plain data with string keys");
@@ -146,6 +147,8 @@ pub struct ReconstructSummary {
     pub region: Region,
     /// Photographs used.
     pub images: usize,
+    /// What trained.
+    pub device: String,
     /// The training.
     pub training: TrainSummary,
     /// Triangles of the mesh.
@@ -158,17 +161,18 @@ pub struct ReconstructSummary {
 /// cameras were corrected, their poses are written to `cameras_to/pose/`.
 ///
 /// # Errors
-/// As [`RayDataset::open`], [`train`] and [`extract`].
+/// As [`RayDataset::open`], [`Device::model`], [`train`] and [`extract`].
 pub fn reconstruct(
     sequence: &Sequence,
     options: &FieldOptions,
+    device: &dyn Device,
     cameras_to: Option<&Path>,
     progress: &dyn Progress,
 ) -> Result<(TriangleMesh, ReconstructSummary)> {
     let all = DataOptions { hold_out_every: 0, ..options.data.clone() };
     let options = FieldOptions { data: all, ..options.clone() };
     let data = RayDataset::open(sequence, &options.data, progress)?;
-    let Trained { model, cameras, summary: training } = options.train(&data, progress)?;
+    let Trained { model, cameras, summary: training } = options.train(&data, device, progress)?;
     let mesh = extract(model.as_ref(), &data, &cameras, &options.surface, progress)?;
     if let Some(folder) = cameras_to.filter(|_| cameras.size().is_some()) {
         write_cameras(folder, &data, &cameras)?;
@@ -177,6 +181,7 @@ pub fn reconstruct(
         options,
         region: *data.region(),
         images: data.views().len(),
+        device: device.name(),
         training,
         triangles: mesh.triangles.len(),
         warnings: data.warnings().to_vec(),
@@ -189,7 +194,8 @@ pub fn reconstruct(
 pub struct ViewScore {
     /// Which frame.
     pub frame: FrameId,
-    /// Against the photograph at working size.
+    /// Against the photograph at working size, or, of a model that learned with masks, against the object in it before
+    /// black.
     pub psnr_db: f64,
 }
 
@@ -213,6 +219,8 @@ pub struct SynthesizeSummary {
     pub options: FieldOptions,
     /// Where the object was taken to be (world frame).
     pub region: Region,
+    /// What trained.
+    pub device: String,
     /// The training.
     pub training: TrainSummary,
     /// Rendered views.
@@ -229,10 +237,11 @@ pub struct SynthesizeSummary {
 /// size as `reference/NNNNNN.png`, so that `eval views --gt OUT/reference --pred OUT` scores them; or others.
 ///
 /// # Errors
-/// As [`RayDataset::open`], [`train`], [`CameraPath`] and [`write_film`]; a picture cannot be written.
+/// As [`RayDataset::open`], [`Device::model`], [`train`], [`CameraPath`] and [`write_film`]; a picture cannot be written.
 pub fn synthesize(
     sequence: &Sequence,
     options: &FieldOptions,
+    device: &dyn Device,
     views: &Views,
     progress: &dyn Progress,
 ) -> Result<SynthesizeSummary> {
@@ -242,7 +251,7 @@ pub fn synthesize(
         CameraPath::HeldOut => Vec::new(),
         path => new_views(path, &data, sequence.image_size())?,
     };
-    let Trained { model, cameras, summary: training } = options.train(&data, progress)?;
+    let Trained { model, cameras, summary: training } = options.train(&data, device, progress)?;
     let mut per_image = Vec::new();
     let mut images = Vec::new();
     let held_out: Vec<_> = data.views().iter().enumerate().filter(|(_, v)| v.held_out && others.is_empty()).collect();
@@ -256,8 +265,9 @@ pub fn synthesize(
     };
     for (index, view) in &held_out {
         let image = render_view(model.as_ref(), view, *index, &cameras);
-        mb_image::write_rgb_png(views.out.join("reference").join(format!("{}.png", view.frame)), &view.rgb)?;
-        per_image.push(ViewScore { frame: view.frame, psnr_db: image_psnr_db(&image, &view.rgb) });
+        let shown = view.shown(model.only_object());
+        mb_image::write_rgb_png(views.out.join("reference").join(format!("{}.png", view.frame)), &shown)?;
+        per_image.push(ViewScore { frame: view.frame, psnr_db: image_psnr_db(&image, &shown) });
         keep(view, image)?;
     }
     for view in &others {
@@ -270,6 +280,7 @@ pub fn synthesize(
     Ok(SynthesizeSummary {
         options: options.clone(),
         region: *data.region(),
+        device: device.name(),
         training,
         images: held_out.len() + others.len(),
         psnr_db: (!per_image.is_empty()).then_some(mean),

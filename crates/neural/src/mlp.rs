@@ -182,7 +182,7 @@ impl Mlp {
     }
 
     /// Sizes and offsets of each layer: (inputs, outputs, row length, offset of the weights, offset of the bias).
-    pub(crate) fn layout(&self) -> impl Iterator<Item = (usize, usize, usize, usize, usize)> + '_ {
+    pub fn layout(&self) -> impl Iterator<Item = (usize, usize, usize, usize, usize)> + '_ {
         self.layers.iter().map(|l| (l.inputs, l.outputs, l.out_stride, l.weights, l.bias))
     }
 

@@ -1,5 +1,7 @@
 //! What the trainer needs of a method.
 
+use mb_job::Result;
+
 use crate::cameras::CameraResiduals;
 use crate::dataset::{RayDataset, SceneRay};
 
@@ -30,10 +32,23 @@ pub struct Level {
 pub trait Model: Sync {
     /// `nerf`, `neus`, `dvgo`.
     fn name(&self) -> &'static str;
+    /// Whether it learned only the object, before black: what [`crate::dataset::View::shown`] then gives is its
+    /// measure.
+    fn only_object(&self) -> bool;
     /// Steps of a whole run.
     fn iterations(&self) -> u64;
     /// One step, counted from 0.
-    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport;
+    ///
+    /// # Errors
+    /// The device was lost or ran out of memory.
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport>;
+    /// Brings what a device has learned to this side; everything below is asked for after it.
+    ///
+    /// # Errors
+    /// As [`Self::step`].
+    fn fetch(&mut self) -> Result<()> {
+        Ok(())
+    }
     /// Colours of rays.
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]>;
     /// The surface's level.
@@ -51,7 +66,7 @@ pub trait Model: Sync {
     ///
     /// # Errors
     /// The buffers do not fit the model.
-    fn restored(&mut self, step: u64) -> Result<(), String>;
+    fn restored(&mut self, step: u64) -> std::result::Result<(), String>;
     /// Whether every parameter is a finite number.
     fn is_finite(&self) -> bool;
     /// Number of parameters.
@@ -61,7 +76,7 @@ pub trait Model: Sync {
 }
 
 /// Whether a checkpoint gave each buffer the length that it has to have.
-pub(crate) fn same_lengths(buffers: &[&mut Vec<f32>], lengths: &[usize]) -> Result<(), String> {
+pub fn same_lengths(buffers: &[&mut Vec<f32>], lengths: &[usize]) -> std::result::Result<(), String> {
     if buffers.len() == lengths.len() && buffers.iter().zip(lengths).all(|(b, n)| b.len() == *n) {
         Ok(())
     } else {

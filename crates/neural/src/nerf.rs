@@ -5,7 +5,7 @@
 //! the point where less than a thousandth of the light is left are dropped, colours are composited
 //! ([`crate::composite`]), and the squared error is sent back.
 
-use mb_job::{Rng, rng};
+use mb_job::{Result, Rng, rng};
 use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -17,7 +17,7 @@ use crate::contraction::{contract, contract_gradient};
 use crate::dataset::{RayDataset, SceneRay, TargetRay};
 use crate::hash_grid::HashGridOptions;
 use crate::model::{GROUPS, Level, Model, StepReport, TILE, same_lengths};
-use crate::occupancy::{CELL_MEMORY, OccupancyGrid, TURNS};
+use crate::occupancy::{CELL_MEMORY, OccupancyGrid, TURNS, looks_everywhere};
 use crate::radiance_field::{RadianceField, RadianceFieldOptions, RadianceParameters, RadianceWorker, Transposed};
 use crate::ray_samples::RaySamples;
 
@@ -128,19 +128,23 @@ struct Task<'a> {
     move_cameras: bool,
 }
 
-/// A NeRF in training.
+/// A NeRF in training. Its state is open, for a device that trains it elsewhere.
 pub struct Nerf {
-    options: NerfOptions,
-    field: RadianceField,
-    parameters: RadianceParameters,
-    occupancy: OccupancyGrid,
-    /// Running mean of the samples of a ray.
-    samples_per_ray: Vec<f32>,
+    /// How it is trained.
+    pub options: NerfOptions,
+    /// Its sizes.
+    pub field: RadianceField,
+    /// What it has learned.
+    pub parameters: RadianceParameters,
+    /// Where matter may be.
+    pub occupancy: OccupancyGrid,
+    /// Running mean of the samples of a ray (one number).
+    pub samples_per_ray: Vec<f32>,
     groups: Vec<Group>,
 }
 
 /// Light below which the rest of a ray is dropped.
-const DARK: f32 = 1e-3;
+pub const DARK: f32 = 1e-3;
 
 impl Nerf {
     /// A NeRF at its start. Where fewer than two cameras look, nothing can be known and nothing is kept.
@@ -159,8 +163,24 @@ impl Nerf {
         }
     }
 
+    /// Rays of each group of the next step.
+    pub fn rays_of_group(&self) -> usize {
+        let wanted = self.options.samples_per_step as f32 / self.samples_per_ray[0].max(1.0);
+        (wanted as usize / GROUPS).clamp(8, 1024)
+    }
+
+    /// Notes how many samples a step took on so many rays.
+    pub fn count_samples(&mut self, samples: usize, rays: usize) {
+        self.samples_per_ray[0] += 0.1 * (samples as f32 / rays as f32 - self.samples_per_ray[0]);
+    }
+
+    /// The random numbers of a refresh.
+    pub fn occupancy_seed(&self) -> u64 {
+        self.options.seed ^ 0x6f63
+    }
+
     /// Adds a ray's samples to the tile; `jitter` in 0..1 shifts them by a part of a step.
-    fn march(&self, ray: &SceneRay, jitter: f32, samples: &mut RaySamples<3>) {
+    pub fn march(&self, ray: &SceneRay, jitter: f32, samples: &mut RaySamples<3>) {
         let o = &self.options;
         let step = |t: f32| (t * o.cone).max(o.step);
         let mut t = o.near + jitter * step(o.near);
@@ -291,16 +311,16 @@ impl Nerf {
     /// A cell counts where a shortest step through it stops a hundredth of the light, or, while everything is thin,
     /// where it is denser than the mean (as in instant-ngp). After the first round a haze below four times the mean
     /// has to go, or a processor would spend most of its samples on it.
-    fn occupancy_threshold(&self, turn: u64) -> f32 {
+    pub fn occupancy_threshold(&self, turn: u64) -> f32 {
         let thin = self.occupancy.mean() * if turn < TURNS { 1.0 } else { 4.0 };
         thin.min(0.01 / self.options.step)
     }
 
-    /// The `turn`-th refresh. Turns 1, 3, 7, 15 look at every cell, so that empty space is left early.
+    /// The `turn`-th refresh.
     fn refresh_occupancy(&mut self, turn: u64) {
-        let all = turn < TURNS && (turn + 1).is_power_of_two();
+        let (seed, all) = (self.occupancy_seed(), looks_everywhere(turn));
         let (field, parameters) = (&self.field, &self.parameters);
-        self.occupancy.update(self.options.seed ^ 0x6f63, turn, all, CELL_MEMORY, |positions, out| {
+        self.occupancy.update(seed, turn, all, CELL_MEMORY, |positions, out| {
             let mut worker = RadianceWorker::default();
             for tile in positions.chunks(TILE) {
                 field.density(parameters, tile, &mut worker);
@@ -316,13 +336,16 @@ impl Model for Nerf {
         "nerf"
     }
 
+    fn only_object(&self) -> bool {
+        self.options.object_only
+    }
+
     fn iterations(&self) -> u64 {
         self.options.iterations
     }
 
-    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport {
-        let wanted = self.options.samples_per_step as f32 / self.samples_per_ray[0].max(1.0);
-        let rays = (wanted as usize / GROUPS).clamp(8, 1024);
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
+        let rays = self.rays_of_group();
         let transposed = self.field.transpose(&self.parameters);
         let move_cameras = cameras.wants_gradients(step);
         let task = Task { data, cameras, transposed: &transposed, rays, move_cameras };
@@ -347,12 +370,12 @@ impl Model for Nerf {
         }
         self.groups = groups;
         self.parameters.step(self.options.learning_rate * factor, step + 1);
-        self.samples_per_ray[0] += 0.1 * (samples as f32 / n as f32 - self.samples_per_ray[0]);
+        self.count_samples(samples, rays * GROUPS);
         if (step + 1).is_multiple_of(self.options.occupancy_every) {
             self.refresh_occupancy((step + 1) / self.options.occupancy_every);
         }
         let loss = mse + f64::from(self.options.distortion) * distortion;
-        StepReport { loss, mse, rays: rays * GROUPS, samples }
+        Ok(StepReport { loss, mse, rays: rays * GROUPS, samples })
     }
 
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
@@ -419,7 +442,7 @@ impl Model for Nerf {
         all
     }
 
-    fn restored(&mut self, _step: u64) -> Result<(), String> {
+    fn restored(&mut self, _step: u64) -> std::result::Result<(), String> {
         let mut lengths: Vec<usize> = self.parameters.lengths();
         lengths.extend(self.occupancy.lengths());
         lengths.push(1);

@@ -9,7 +9,7 @@
 //! (`--lindisp` of the authors' code), and the networks see contracted positions ([`crate::contraction`]), because
 //! frequencies of far positions carry no information.
 
-use mb_job::{Rng, rng};
+use mb_job::{Result, Rng, rng};
 use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -345,11 +345,15 @@ impl Model for NerfOriginal {
         "nerf"
     }
 
+    fn only_object(&self) -> bool {
+        self.with_masks
+    }
+
     fn iterations(&self) -> u64 {
         self.options.iterations
     }
 
-    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport {
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
         let transposed = [self.field.transpose(&self.coarse), self.field.transpose(&self.fine)];
         let transposed = [&transposed[0], &transposed[1]];
         let move_cameras = cameras.wants_gradients(step);
@@ -373,7 +377,7 @@ impl Model for NerfOriginal {
         let (loss, mse) = (mean(|g| g.loss), mean(|g| g.squared));
         self.groups = groups;
         let samples = rays * (2 * self.options.coarse_samples + self.options.fine_samples);
-        StepReport { loss, mse, rays, samples }
+        Ok(StepReport { loss, mse, rays, samples })
     }
 
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
@@ -428,7 +432,7 @@ impl Model for NerfOriginal {
         all
     }
 
-    fn restored(&mut self, _step: u64) -> Result<(), String> {
+    fn restored(&mut self, _step: u64) -> std::result::Result<(), String> {
         let mut lengths = self.coarse.lengths();
         lengths.extend(self.fine.lengths());
         same_lengths(&self.buffers(), &lengths)

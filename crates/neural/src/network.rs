@@ -43,6 +43,16 @@ impl Network {
         &self.mlp
     }
 
+    /// Weights and biases; directions of the weights, where they are normalised.
+    pub fn direct(&self) -> &Parameters {
+        &self.direct
+    }
+
+    /// The same, to be replaced; call [`Self::refresh`] afterwards.
+    pub fn direct_mut(&mut self) -> &mut Parameters {
+        &mut self.direct
+    }
+
     /// Number of parameters, lengths of weight normalisation included as PyTorch counts them, padding not.
     pub fn parameter_count(&self) -> usize {
         self.mlp.parameter_count() + self.gains.values.len()

@@ -11,12 +11,12 @@
 //! fine), so that the shape settles before its details. All derivatives are exact ([`crate::sdf_field`],
 //! [`crate::neus_alpha`], [`crate::composite`]).
 
-use mb_job::{Rng, rng};
+use mb_job::{Result, Rng, rng};
 use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::adam::{AdamOptions, Parameters, Schedule};
+use crate::adam::{Parameters, Schedule};
 use crate::cameras::{CameraResiduals, RayGradient};
 use crate::composite::{CompositeGradient, RayComposites, opacity};
 use crate::contraction::{contract, contract_gradient};
@@ -24,8 +24,10 @@ use crate::dataset::{RayDataset, SceneRay, TargetRay};
 use crate::hash_grid::HashGridOptions;
 use crate::model::{GROUPS, Level, Model, StepReport, TILE, same_lengths};
 use crate::neus_alpha::Section;
-use crate::occupancy::{CELL_MEMORY, OccupancyGrid, TURNS};
-use crate::radiance_field::{RadianceField, RadianceFieldOptions, RadianceParameters, RadianceWorker, Transposed};
+use crate::occupancy::{CELL_MEMORY, OccupancyGrid, looks_everywhere};
+use crate::radiance_field::{
+    ADAM, RadianceField, RadianceFieldOptions, RadianceParameters, RadianceWorker, Transposed,
+};
 use crate::ray_samples::RaySamples;
 use crate::sdf_field::{DirectionEncoding, PositionEncoding, SdfField, SdfFieldOptions, SdfWorker};
 use crate::simd::sigmoid;
@@ -192,27 +194,37 @@ struct Task<'a> {
     move_cameras: bool,
 }
 
-/// A NeuS in training.
+/// A NeuS in training. Its state is open, for a device that trains it elsewhere.
 pub struct Neus {
-    options: NeusOptions,
-    field: SdfField,
-    outside: RadianceField,
-    outside_parameters: RadianceParameters,
+    /// How it is trained.
+    pub options: NeusOptions,
+    /// The surface.
+    pub field: SdfField,
+    /// What lies behind the ball.
+    pub outside: RadianceField,
+    /// What was learned of it.
+    pub outside_parameters: RadianceParameters,
     /// v, with sharpness s = exp(10 v).
-    sharpness: Parameters,
-    inner_cells: OccupancyGrid,
-    outer_cells: OccupancyGrid,
-    samples_per_ray: Vec<f32>,
+    pub sharpness: Parameters,
+    /// Where the surface may be, in the ball.
+    pub inner_cells: OccupancyGrid,
+    /// Where matter may be, in contracted space.
+    pub outer_cells: OccupancyGrid,
+    /// Running mean of the samples of a ray inside the ball (one number).
+    pub samples_per_ray: Vec<f32>,
     groups: Vec<Group>,
-    with_masks: bool,
+    /// Whether it learns only the object.
+    pub with_masks: bool,
 }
 
 /// Light below which the rest of a ray is dropped.
-const DARK: f32 = 1e-3;
+pub const DARK: f32 = 1e-3;
 /// Half width of the logistic density in units of 1 / s: beyond it lies less than a thousandth of the step.
 const REACH: f32 = 7.0;
+/// Shortest step behind the ball.
+pub const SHORTEST_OUTER_STEP: f32 = 0.02;
 /// Random points of the ball in each group, for the eikonal loss alone.
-const FREE_POINTS: usize = 32;
+pub const FREE_POINTS: usize = 32;
 
 impl Neus {
     /// A NeuS at its start. Masks are used where the data has them and the options want them.
@@ -238,7 +250,8 @@ impl Neus {
         neus
     }
 
-    fn set_levels(&mut self, step: u64) {
+    /// Puts the levels into use that belong to a step.
+    pub fn set_levels(&mut self, step: u64) {
         let more = step / self.options.level_every.max(1);
         self.field.active_levels = (self.options.first_levels + more as usize).min(self.field.levels());
     }
@@ -248,7 +261,14 @@ impl Neus {
         (10.0 * self.sharpness.values[0]).clamp(-10.0, 12.0).exp()
     }
 
-    fn anneal(&self, step: u64) -> f32 {
+    /// One Adam step of the sharpness, number `t` from 1, given the loss's derivative by it: ds/dv = 10 s.
+    pub fn step_sharpness(&mut self, d_sharpness: f32, t: u64) {
+        self.sharpness.grads[0] = d_sharpness * 10.0 * self.sharpness();
+        self.sharpness.step(&ADAM, self.options.sharpness_learning_rate, t);
+    }
+
+    /// How far rays must face the surface: r of [`crate::neus_alpha`].
+    pub fn anneal(&self, step: u64) -> f32 {
         if self.options.anneal == 0 { 1.0 } else { (step as f32 / self.options.anneal as f32).min(1.0) }
     }
 
@@ -258,11 +278,32 @@ impl Neus {
         REACH / self.sharpness() + cell * 3f32.sqrt()
     }
 
+    /// Rays of each group of the next step.
+    pub fn rays_of_group(&self) -> usize {
+        let wanted = self.options.samples_per_step as f32 / self.samples_per_ray[0].max(1.0);
+        (wanted as usize / GROUPS).clamp(8, 128)
+    }
+
+    /// Notes how many samples inside the ball a step took on so many rays.
+    pub fn count_samples(&mut self, samples: usize, rays: usize) {
+        self.samples_per_ray[0] += 0.1 * (samples as f32 / rays as f32 - self.samples_per_ray[0]);
+    }
+
+    /// Length of a step inside the ball.
+    pub fn inner_step(&self) -> f32 {
+        (1.0 / self.sharpness()).clamp(self.options.shortest_step, self.options.longest_step)
+    }
+
+    /// Where samples begin behind the ball, given where a ray enters and leaves it.
+    pub fn outer_start(ball: Option<(f32, f32)>) -> f32 {
+        ball.map_or(0.5, |(_, far)| far)
+    }
+
     fn march(&self, ray: &SceneRay, jitter: f32, tile: &mut Tile) {
         let o = &self.options;
         let ball = ray.ball(1.0);
         if let Some((near, far)) = ball {
-            let dt = (1.0 / self.sharpness()).clamp(o.shortest_step, o.longest_step);
+            let dt = self.inner_step();
             let mut t = near + jitter * dt;
             while t < far {
                 let p = ray.at(t);
@@ -273,8 +314,8 @@ impl Neus {
             }
         }
         if !self.with_masks {
-            let start = ball.map_or(0.5, |(_, far)| far);
-            let step = |t: f32| (t * o.background_cone).max(0.02);
+            let start = Self::outer_start(ball);
+            let step = |t: f32| (t * o.background_cone).max(SHORTEST_OUTER_STEP);
             let mut t = start + jitter * step(start);
             while t < o.far {
                 let dt = step(t);
@@ -463,20 +504,21 @@ impl Neus {
     }
 
     fn refresh_cells(&mut self, turn: u64) {
-        let all = turn < TURNS && (turn + 1).is_power_of_two();
+        let all = looks_everywhere(turn);
+        let [inner_seed, outer_seed] = self.cell_seeds();
         let field = &self.field;
-        // The distance is known at once: nothing is remembered. Nearness is 1 / (|f| + 0.001).
-        self.inner_cells.update(self.options.seed ^ 0x696e, turn, all, 0.0, |units, out| {
+        // The distance is known at once: nothing is remembered.
+        self.inner_cells.update(inner_seed, turn, all, 0.0, |units, out| {
             let mut worker = SdfWorker::default();
             for tile in units.chunks(TILE) {
                 let tile: Vec<[f32; 3]> = tile.iter().map(|u| u.map(|c| 2.0 * c - 1.0)).collect();
                 field.distance(&tile, &mut worker);
-                out.extend(worker.sdf.iter().map(|f| 1.0 / (f.abs() + 1e-3)));
+                out.extend(worker.sdf.iter().map(|f| nearness(*f)));
             }
         });
         if !self.with_masks {
             let (outside, parameters) = (&self.outside, &self.outside_parameters);
-            self.outer_cells.update(self.options.seed ^ 0x6f75, turn, all, CELL_MEMORY, |units, out| {
+            self.outer_cells.update(outer_seed, turn, all, CELL_MEMORY, |units, out| {
                 let mut worker = RadianceWorker::default();
                 for tile in units.chunks(TILE) {
                     outside.density(parameters, tile, &mut worker);
@@ -487,10 +529,21 @@ impl Neus {
         self.decide();
     }
 
-    fn decide(&mut self) {
-        self.inner_cells.decide(1.0 / (self.band() + 1e-3));
+    /// The random numbers of a refresh of the inner and of the outer cells.
+    pub fn cell_seeds(&self) -> [u64; 2] {
+        [self.options.seed ^ 0x696e, self.options.seed ^ 0x6f75]
+    }
+
+    /// Decides which cells count, from what was found in them.
+    pub fn decide(&mut self) {
+        self.inner_cells.decide(nearness(self.band()));
         self.outer_cells.decide(self.outer_cells.mean().min(0.5));
     }
+}
+
+/// What a cell of the inner grid keeps of a distance.
+pub fn nearness(sdf: f32) -> f32 {
+    1.0 / (sdf.abs() + 1e-3)
 }
 
 pub(crate) fn section(sdf: &SdfWorker, i: usize, dt: f32, direction: [f32; 3]) -> Section {
@@ -534,14 +587,17 @@ impl Model for Neus {
         "neus"
     }
 
+    fn only_object(&self) -> bool {
+        self.with_masks
+    }
+
     fn iterations(&self) -> u64 {
         self.options.iterations
     }
 
-    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport {
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
         self.set_levels(step);
-        let wanted = self.options.samples_per_step as f32 / self.samples_per_ray[0].max(1.0);
-        let rays = (wanted as usize / GROUPS).clamp(8, 128);
+        let rays = self.rays_of_group();
         let transposed = self.outside.transpose(&self.outside_parameters);
         let move_cameras = cameras.wants_gradients(step);
         let task = Task { data, cameras, transposed: &transposed, rays, step, move_cameras };
@@ -562,26 +618,24 @@ impl Model for Neus {
         let loss = groups.iter().map(|g| g.loss).sum::<f64>() / n;
         let mse = groups.iter().map(|g| g.squared).sum::<f64>() / (3.0 * n);
         let samples = groups.iter().map(|g| g.marched).sum::<usize>();
-        // ds/dv = 10 s.
-        self.sharpness.grads[0] = groups.iter().map(|g| g.d_sharpness).sum::<f32>() * 10.0 * self.sharpness();
+        let d_sharpness = groups.iter().map(|g| g.d_sharpness).sum();
         for group in &mut groups {
             self.outer_cells.raise(&group.seen);
             group.seen.clear();
         }
         self.groups = groups;
         let factor = self.options.schedule.factor(step + 1);
-        let adam = AdamOptions { beta2: 0.99, epsilon: 1e-15, ..AdamOptions::default() };
         let (table, network) = (self.options.table_learning_rate * factor, self.options.learning_rate * factor);
-        self.field.step(&adam, table, network, step + 1);
-        self.sharpness.step(&adam, self.options.sharpness_learning_rate, step + 1);
+        self.field.step(&ADAM, table, network, step + 1);
+        self.step_sharpness(d_sharpness, step + 1);
         if !self.with_masks {
             self.outside_parameters.step(table, step + 1);
         }
-        self.samples_per_ray[0] += 0.1 * (samples as f32 / n as f32 - self.samples_per_ray[0]);
+        self.count_samples(samples, rays * GROUPS);
         if (step + 1).is_multiple_of(self.options.occupancy_every) {
             self.refresh_cells((step + 1) / self.options.occupancy_every);
         }
-        StepReport { loss, mse, rays: rays * GROUPS, samples }
+        Ok(StepReport { loss, mse, rays: rays * GROUPS, samples })
     }
 
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
@@ -636,7 +690,7 @@ impl Model for Neus {
         all
     }
 
-    fn restored(&mut self, step: u64) -> Result<(), String> {
+    fn restored(&mut self, step: u64) -> std::result::Result<(), String> {
         let mut lengths = self.field.lengths();
         lengths.extend(self.outside_parameters.lengths());
         lengths.extend([1, 1, 1]);

@@ -10,7 +10,7 @@
 //! The loss is `sum_rgb |C - C*| + eikonal * mean (|n| - 1)^2 + mask * BCE(sum w, mask)`, the second over sections within
 //! 1.2 radii. Nothing is sent back through the places of the samples.
 
-use mb_job::{Rng, rng};
+use mb_job::{Result, Rng, rng};
 use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -446,11 +446,15 @@ impl Model for NeusOriginal {
         "neus"
     }
 
+    fn only_object(&self) -> bool {
+        self.with_masks
+    }
+
     fn iterations(&self) -> u64 {
         self.options.iterations
     }
 
-    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> StepReport {
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
         let transposed = self.outside.transpose(&self.outside_parameters);
         let mut groups = std::mem::take(&mut self.groups);
         groups.par_iter_mut().enumerate().for_each(|(i, group)| {
@@ -480,7 +484,7 @@ impl Model for NeusOriginal {
             samples: groups.iter().map(|g| g.samples).sum(),
         };
         self.groups = groups;
-        report
+        Ok(report)
     }
 
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
@@ -521,7 +525,7 @@ impl Model for NeusOriginal {
         all
     }
 
-    fn restored(&mut self, _step: u64) -> Result<(), String> {
+    fn restored(&mut self, _step: u64) -> std::result::Result<(), String> {
         let mut lengths = self.field.lengths();
         lengths.extend(self.outside_parameters.lengths());
         lengths.extend([1; 3]);

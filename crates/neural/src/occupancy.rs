@@ -24,6 +24,11 @@ pub struct OccupancyGrid {
 
 /// A cell is refreshed in every sixteenth update.
 pub const TURNS: u64 = 16;
+/// Whether the `turn`-th refresh looks at all cells: turns 1, 3, 7 and 15, so that empty space is left early.
+pub fn looks_everywhere(turn: u64) -> bool {
+    turn < TURNS && (turn + 1).is_power_of_two()
+}
+
 /// What the running maximum of a density keeps at each refresh. instant-ngp has 0.95, but looks at a cell every 16 to 64
 /// steps; here 256 steps lie between two looks, and a haze that has gone must not be marched through for thousands.
 pub const CELL_MEMORY: f32 = 0.4;
@@ -114,28 +119,58 @@ impl OccupancyGrid {
         decay: f32,
         density: impl Fn(&[[f32; 3]], &mut Vec<f32>) + Sync,
     ) {
+        let (cells, positions) = self.points_of_turn(seed, turn, all);
+        let found: Vec<Vec<f32>> = positions
+            .par_chunks(PIECE)
+            .map(|positions| {
+                let mut found = Vec::with_capacity(positions.len());
+                density(positions, &mut found);
+                found
+            })
+            .collect();
+        self.remember(&cells, &found.concat(), decay);
+    }
+
+    /// The first half of [`Self::update`]: the cells that the turn looks at, and a random point of each.
+    pub fn points_of_turn(&self, seed: u64, turn: u64, all: bool) -> (Vec<u32>, Vec<[f32; 3]>) {
         let r = self.resolution;
         let offset = (turn % TURNS) as usize;
-        self.values.par_chunks_mut(PIECE).enumerate().for_each(|(piece, values)| {
-            let mut rng = rng(seed, turn.wrapping_mul(1 << 20) + piece as u64);
-            let cells: Vec<usize> = (0..values.len())
-                .filter(|i| !self.closed[piece * PIECE + i])
-                .filter(|i| all || (piece * PIECE + i) % TURNS as usize == offset)
-                .collect();
-            let positions: Vec<[f32; 3]> = cells
-                .iter()
-                .map(|i| {
-                    let i = piece * PIECE + i;
-                    [i % r, i / r % r, i / (r * r)].map(|c| (c as f32 + rng.random::<f32>()) / r as f32)
-                })
-                .collect();
-            let mut found = Vec::with_capacity(cells.len());
-            density(&positions, &mut found);
-            for (i, density) in cells.into_iter().zip(found) {
-                let kept = if values[i].is_finite() { decay * values[i] } else { 0.0 };
-                values[i] = kept.max(density);
-            }
-        });
+        let pieces: Vec<(Vec<u32>, Vec<[f32; 3]>)> = self
+            .closed
+            .par_chunks(PIECE)
+            .enumerate()
+            .map(|(piece, closed)| {
+                let mut rng = rng(seed, turn.wrapping_mul(1 << 20) + piece as u64);
+                (0..closed.len())
+                    .filter(|i| !closed[*i] && (all || (piece * PIECE + i) % TURNS as usize == offset))
+                    .map(|i| {
+                        let i = piece * PIECE + i;
+                        let cell = [i % r, i / r % r, i / (r * r)];
+                        (i as u32, cell.map(|c| (c as f32 + rng.random::<f32>()) / r as f32))
+                    })
+                    .unzip()
+            })
+            .collect();
+        let mut all = (Vec::new(), Vec::new());
+        for (cells, points) in pieces {
+            all.0.extend(cells);
+            all.1.extend(points);
+        }
+        all
+    }
+
+    /// The second half of [`Self::update`]: what was found at the points.
+    pub fn remember(&mut self, cells: &[u32], found: &[f32], decay: f32) {
+        for (cell, found) in cells.iter().zip(found) {
+            let value = &mut self.values[*cell as usize];
+            let kept = if value.is_finite() { decay * *value } else { 0.0 };
+            *value = kept.max(*found);
+        }
+    }
+
+    /// Which cells are occupied, x fastest.
+    pub fn occupied(&self) -> &[bool] {
+        &self.occupied
     }
 
     /// Mean of the open cells that have been looked at; infinite before the first look.

@@ -15,7 +15,7 @@ use crate::mlp::{Activation, Mlp, MlpCache, MlpShape, Weights};
 use crate::simd::{dispatched, exp, padded, sigmoid};
 
 /// Numbers that the density network hands to the colour network.
-const GEOMETRY: usize = 16;
+pub const GEOMETRY: usize = 16;
 /// Row length of the colour network's input.
 const COLOR_IN: usize = GEOMETRY + HARMONICS;
 
@@ -30,6 +30,9 @@ pub struct RadianceFieldOptions {
     /// Hidden layers of the colour network; the density network has one.
     pub color_hidden: usize,
 }
+
+/// Of all parameters (instant-ngp, appendix). The table also skips what no sample touched.
+pub const ADAM: AdamOptions = AdamOptions { beta1: 0.9, beta2: 0.99, epsilon: 1e-15, skip_untouched: false };
 
 /// The field's sizes, worked out.
 #[derive(Debug, Clone)]
@@ -101,6 +104,11 @@ impl RadianceField {
         let density = shape(grid.width(), 1, GEOMETRY);
         let color = shape(COLOR_IN, options.color_hidden, 3);
         Self { grid, density, color }
+    }
+
+    /// The encoding, the density network and the colour network.
+    pub fn parts(&self) -> (&HashGrid, &Mlp, &Mlp) {
+        (&self.grid, &self.density, &self.color)
     }
 
     /// Parameters at their start.
@@ -278,11 +286,9 @@ impl RadianceField {
 impl RadianceParameters {
     /// One Adam step, number `t` from 1. The table skips what no sample touched.
     pub fn step(&mut self, lr: f32, t: u64) {
-        // instant-ngp, appendix: beta2 = 0.99, epsilon = 1e-15.
-        let options = AdamOptions { beta2: 0.99, epsilon: 1e-15, ..AdamOptions::default() };
-        self.table.step(&AdamOptions { skip_untouched: true, ..options }, lr, t);
-        self.density.step(&options, lr, t);
-        self.color.step(&options, lr, t);
+        self.table.step(&AdamOptions { skip_untouched: true, ..ADAM }, lr, t);
+        self.density.step(&ADAM, lr, t);
+        self.color.step(&ADAM, lr, t);
     }
 
     /// All buffers that a checkpoint holds.

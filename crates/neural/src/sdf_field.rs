@@ -102,6 +102,19 @@ pub struct SdfField {
     pub active_levels: usize,
 }
 
+/// What a field on a hash grid is made of.
+#[derive(Debug, Clone, Copy)]
+pub struct SdfParts<'a> {
+    /// Encoding of the position.
+    pub grid: &'a HashGrid,
+    /// Its table.
+    pub table: &'a Parameters,
+    /// Distance and features.
+    pub geometry: (&'a Mlp, &'a Parameters),
+    /// Colour.
+    pub color: (&'a Mlp, &'a Parameters),
+}
+
 /// Buffers for one worker: a tile in flight, and the gradients gathered since the last [`SdfField::collect`].
 #[derive(Debug, Default)]
 pub struct SdfWorker {
@@ -182,6 +195,26 @@ impl SdfField {
             directions,
             options,
         }
+    }
+
+    /// The hash grid, the geometry network and the colour network, each with its parameters; `None` where the field has
+    /// frequencies, weight normalisation or a skip layer.
+    pub fn parts(&self) -> Option<SdfParts<'_>> {
+        let grid = self.grid.as_ref()?;
+        let plain = self.options.direction == DirectionEncoding::Harmonics
+            && !self.options.weight_norm
+            && self.options.skip.is_none();
+        plain.then(|| SdfParts {
+            grid,
+            table: &self.table,
+            geometry: (self.geometry.mlp(), self.geometry.direct()),
+            color: (self.color.mlp(), self.color.direct()),
+        })
+    }
+
+    /// The parameters of [`Self::parts`] in their order, to be replaced; call [`Self::refresh`] afterwards.
+    pub fn parts_mut(&mut self) -> [&mut Parameters; 3] {
+        [&mut self.table, self.geometry.direct_mut(), self.color.direct_mut()]
     }
 
     /// Number of parameters, padding not counted.

@@ -128,13 +128,16 @@ pub fn train(
     let mut curve = Vec::new();
     let mut window = Window::default();
     let mut best = f64::INFINITY;
-    let mut what = format!("training {}", model.name());
+    let what = format!("training {}", model.name());
     progress.report(&what, step as usize, total as usize);
     while step < total {
-        let report = model.step(data, cameras, step);
+        let report = model.step(data, cameras, step).map_err(|e| kept(e, run))?;
         step += 1;
         window.add(&report);
         let point_due = step.is_multiple_of(run.report_every.max(1)) || step == total;
+        if point_due {
+            model.fetch().map_err(|e| kept(e, run))?;
+        }
         if !report.loss.is_finite() || (point_due && !model.is_finite()) {
             return Err(diverged(step, "a number is no longer finite", run));
         }
@@ -152,28 +155,23 @@ pub fn train(
                     return Err(diverged(step, "the loss rose to ten times its best", run));
                 }
             }
-            let left = point.seconds / (step - first_step) as f64 * (total - step) as f64;
-            what = format!(
-                "training {}: {:.1} dB, loss {:.4}, {} left",
-                model.name(),
-                point.psnr_db,
-                point.loss,
-                time(left)
-            );
+            progress.note(&what, &format!("{:.1} dB, loss {:.4}", point.psnr_db, point.loss));
             curve.push(point);
         }
         progress.report(&what, step as usize, total as usize);
         let stop = progress.stop_requested();
-        if let Some(path) = &run.checkpoint
-            && (stop || step == total || step.is_multiple_of(run.checkpoint_every.max(1)))
-        {
+        let due = |every: u64| step == total || step.is_multiple_of(every.max(1));
+        let checkpoint = run.checkpoint.as_ref().filter(|_| stop || due(run.checkpoint_every));
+        let previews = run.previews.as_ref().filter(|_| due(run.preview_every));
+        if checkpoint.is_some() || previews.is_some() {
+            model.fetch().map_err(|e| kept(e, run))?;
+        }
+        if let Some(path) = checkpoint {
             let mut buffers = model.buffers();
             buffers.extend(cameras.buffers());
             checkpoint::write(path, &header, step, &buffers)?;
         }
-        if let Some(folder) = &run.previews
-            && (step == total || step.is_multiple_of(run.preview_every.max(1)))
-        {
+        if let Some(folder) = previews {
             write_preview(folder, model, data, cameras, step)?;
         }
         if stop && step < total {
@@ -223,25 +221,34 @@ fn write_preview(
     let index = data.views().iter().position(|v| v.held_out).unwrap_or(0);
     let view = &data.views()[index];
     let image = render_view(model, view, index, cameras);
+    let shown = view.shown(model.only_object());
     let (width, height) = (view.size().width, view.size().height);
     let pair = Image::from_fn(ImageSize::new(2 * width, height), |x, y| {
-        if x < width { image[(x, y)] } else { view.rgb[(x - width, y)] }
+        if x < width { image[(x, y)] } else { shown[(x - width, y)] }
     });
     mb_image::write_rgb_png(folder.join(format!("step_{step:07}.png")), &pair)
 }
 
-fn time(seconds: f64) -> String {
-    if seconds < 90.0 { format!("{seconds:.0} s") } else { format!("{:.0} min", seconds / 60.0) }
+fn diverged(step: u64, why: &str, run: &RunOptions) -> Error {
+    Error::Failed(format!(
+        "training diverged at step {step}: {why}{}. Check the poses with `capture check`, or lower the learning rate",
+        last_good_state(run)
+    ))
 }
 
-fn diverged(step: u64, why: &str, run: &RunOptions) -> Error {
-    let kept = match &run.checkpoint {
+/// The failure of a device, with what is left of the run.
+fn kept(error: Error, run: &RunOptions) -> Error {
+    match error {
+        Error::Failed(why) => Error::Failed(why + &last_good_state(run)),
+        other => other,
+    }
+}
+
+fn last_good_state(run: &RunOptions) -> String {
+    match &run.checkpoint {
         Some(path) if path.exists() => format!("; {} holds the last good state", path.display()),
         _ => String::new(),
-    };
-    Error::Failed(format!(
-        "training diverged at step {step}: {why}{kept}. Check the poses with `capture check`, or lower the learning rate"
-    ))
+    }
 }
 
 #[derive(Debug, Default)]

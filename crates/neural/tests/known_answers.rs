@@ -6,6 +6,7 @@ use mb_job::{Error, Progress, Silent};
 use mb_neural::camera_path::CameraPath;
 use mb_neural::cameras::{CameraOptions, CameraResiduals};
 use mb_neural::dataset::{Photograph, RayDataset};
+use mb_neural::device::Processor;
 use mb_neural::dvgo::{Dvgo, DvgoOptions};
 use mb_neural::extract::{SurfaceOptions, extract};
 use mb_neural::frequency_field::{DensityActivation, FrequencyFieldOptions};
@@ -327,7 +328,7 @@ fn a_sequence_on_disk_becomes_a_mesh_and_pictures() {
     options.surface.voxel_mm = 4.0;
     options.cameras = CameraOptions { refine_poses: true, start: 10, ..CameraOptions::default() };
     let cameras = dir.path().join("cameras");
-    let (mesh, summary) = reconstruct(&sequence, &options, Some(&cameras), &Silent).expect("a mesh");
+    let (mesh, summary) = reconstruct(&sequence, &options, &Processor, Some(&cameras), &Silent).expect("a mesh");
     assert_eq!((summary.images, summary.training.steps), (9, 60));
     let bounds = mesh.bounds();
     assert!((bounds.center().coords - CENTER).norm() < 0.03, "the mesh is not in the world frame: {bounds:?}");
@@ -340,7 +341,7 @@ fn a_sequence_on_disk_becomes_a_mesh_and_pictures() {
     let mut views = Views { path: CameraPath::HeldOut, out: out.clone(), film: None, frames_per_second: 30.0 };
     options.run.previews = Some(dir.path().join("previews"));
     options.run.checkpoint = Some(dir.path().join("trained"));
-    let summary = synthesize(&sequence, &options, &views, &Silent).expect("pictures");
+    let summary = synthesize(&sequence, &options, &Processor, &views, &Silent).expect("pictures");
     assert_eq!(
         mb_image::read_size(dir.path().join("previews/step_0000012.png")).expect("a preview"),
         ImageSize::new(128, 64)
@@ -352,7 +353,7 @@ fn a_sequence_on_disk_becomes_a_mesh_and_pictures() {
     // The trained field shows other views without training again.
     for (path, n) in [(CameraPath::Orbit(3), 3), (CameraPath::Folder(cameras), 9)] {
         (views.path, views.out) = (path, dir.path().join(format!("new{n}")));
-        let summary = synthesize(&sequence, &options, &views, &Silent).expect("pictures");
+        let summary = synthesize(&sequence, &options, &Processor, &views, &Silent).expect("pictures");
         assert_eq!((summary.training.first_step, summary.images, summary.psnr_db), (12, n, None));
         assert!(views.out.join(format!("{:06}.png", n - 1)).exists());
     }

@@ -97,10 +97,18 @@ pub fn find_program(name: &str) -> Option<PathBuf> {
     let folders = std::env::var_os("PATH").unwrap_or_default();
     let found = std::env::split_paths(&folders).map(|folder| folder.join(name)).find(|path| path.is_file());
     if found.is_none() {
-        assert!(std::env::var_os("CI").is_none(), "{name} is not installed, and CI must have it");
-        skip(name, "install it");
+        absent(name, "install it");
     }
     found
+}
+
+/// Says that something which the machine must have is not there; the test then passes without testing.
+///
+/// # Panics
+/// On CI.
+pub fn absent(what: &str, help: &str) {
+    assert!(std::env::var_os("CI").is_none(), "{what} is not there, and CI must have it: {help}");
+    skip(what, help);
 }
 
 /// Says that a test passes without testing.

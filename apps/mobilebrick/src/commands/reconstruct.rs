@@ -3,8 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
+use mb_gpu::DeviceChoice;
 use mb_job::{Error, InputError, Result};
 use mb_neural::FieldOptions;
+use mb_neural::device::Device;
 use mb_neural::results::write_beside;
 use mb_recon::{PoseSource, TsdfOptions, reconstruct_tsdf};
 
@@ -148,6 +150,11 @@ pub struct FieldTraining {
     #[arg(long, value_name = "DIR")]
     previews: Option<PathBuf>,
 
+    /// What trains: the processor (cpu), a GPU (gpu, or gpu:N for the one of this number), or auto: a GPU where there is
+    /// one that knows the method. A GPU needs a build with `--features gpu`
+    #[arg(long, value_name = "DEVICE", default_value = "auto")]
+    device: DeviceChoice,
+
     /// Largest memory for photographs, parameters and work, MiB; a run that needs more is refused at its start
     #[arg(long, value_name = "MIB")]
     memory: Option<usize>,
@@ -179,6 +186,11 @@ impl FieldTraining {
             options.run.memory_mib = memory;
         }
         Ok(options)
+    }
+
+    /// What trains a run with these options.
+    pub fn device(&self, options: &FieldOptions) -> Result<Box<dyn Device>> {
+        mb_gpu::device(self.device, options)
     }
 
     /// Removes the state of training after the end, unless the person named a file for it.
@@ -246,16 +258,19 @@ impl Field {
         }
         options.surface.cull &= !self.no_cull;
         let cameras = beside(&self.out, ".cameras");
-        let (mesh, summary) = mb_neural::reconstruct(&self.sequence.open()?, &options, Some(&cameras), terminal)?;
+        let device = self.training.device(&options)?;
+        let (mesh, summary) =
+            mb_neural::reconstruct(&self.sequence.open()?, &options, device.as_ref(), Some(&cameras), terminal)?;
         mb_mesh::write_mesh(&self.out, &mesh)?;
         write_beside(&beside(&self.out, ""), &summary, &summary.training.curve)?;
         self.training.finish(&self.out);
         let text = format!(
-            "wrote {}: {} triangles from {} photographs after {} steps ({:.1} dB)",
+            "wrote {}: {} triangles from {} photographs after {} steps on {} ({:.1} dB)",
             self.out.display(),
             summary.triangles,
             summary.images,
             summary.training.steps,
+            summary.device,
             summary.training.curve.last().map_or(f64::NAN, |p| p.psnr_db),
         );
         Outcome::new(&summary, text)

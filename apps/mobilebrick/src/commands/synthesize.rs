@@ -79,7 +79,8 @@ impl Views {
             film: self.film.clone(),
             frames_per_second: self.fps,
         };
-        let summary = mb_neural::synthesize(&self.sequence.open()?, &options, &views, terminal)?;
+        let device = self.training.device(&options)?;
+        let summary = mb_neural::synthesize(&self.sequence.open()?, &options, device.as_ref(), &views, terminal)?;
         write_beside(&run, &summary, &summary.training.curve)?;
         self.training.finish(&run);
         let mut text = format!("wrote {}: {} views", self.out.display(), summary.images);

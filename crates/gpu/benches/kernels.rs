@@ -1,0 +1,198 @@
+//! Time of each kernel on a device beside its twin on the processor:
+//! `cargo bench -p mb-gpu --features wgpu --bench kernels -- [gpu|gpu:N] [SAMPLES]`. Sizes are those of `nerf` and `neus` with
+//! `--preset fast`.
+//! Device: wall milliseconds, best of five, and CPU milliseconds of this process (which a software device spends, a GPU
+//! does not). Twin: CPU milliseconds. Share: of the arithmetic (GFLOP/s) or traffic (GB/s) that the kernel needs at least.
+
+use std::time::Instant;
+
+use cpu_time::ProcessTime;
+use mb_gpu::DeviceChoice;
+use mb_gpu::context::{Buffer, Context, Work};
+use mb_gpu::encoding::{Encoding, Points, unit_of};
+use mb_gpu::kernels::Kernels;
+use mb_gpu::network::Network;
+use mb_gpu::trained::AdamStep;
+use mb_neural::adam::AdamOptions;
+use mb_neural::hash_grid::Scatter;
+use mb_neural::mlp::{Mlp, MlpCache, Weights};
+use mb_neural::nerf::NerfOptions;
+use mb_neural::neus::NeusOptions;
+use mb_neural::radiance_field::{ADAM, RadianceField};
+use mb_neural::sdf_field::SdfField;
+use rand::RngExt as _;
+
+/// Prints one row.
+struct Rows<'a> {
+    context: &'a Context,
+    probe: &'a Buffer,
+}
+
+impl Rows<'_> {
+    fn row(&self, name: &str, giga: f64, unit: &str, record: impl Fn(&mut Work<'_>), twin: impl FnOnce()) {
+        let (mut wall, mut cpu) = (f64::INFINITY, f64::INFINITY);
+        for _ in 0..5 {
+            let (start, spent) = (Instant::now(), ProcessTime::now());
+            let mut work = self.context.work();
+            record(&mut work);
+            work.submit();
+            self.context.read::<u32>(self.probe, 1).expect("the device works");
+            wall = wall.min(start.elapsed().as_secs_f64());
+            cpu = cpu.min(spent.elapsed().as_secs_f64());
+        }
+        let spent = ProcessTime::now();
+        twin();
+        let twin = spent.elapsed().as_secs_f64();
+        println!("| {name} | {:.2} | {:.2} | {:.2} | {:.1} {unit}/s |", 1e3 * wall, 1e3 * cpu, 1e3 * twin, giga / wall);
+    }
+}
+
+fn main() {
+    let mut arguments = std::env::args().skip(1).filter(|a| a != "--bench");
+    let Some(device) = arguments.next() else {
+        println!("nothing to do: give gpu or gpu:N, and perhaps the number of samples");
+        return;
+    };
+    let DeviceChoice::Gpu(number) = device.parse().expect("gpu or gpu:N") else { panic!("gpu or gpu:N") };
+    let n: usize = arguments.next().map_or(1 << 16, |n| n.parse().expect("a number of samples"));
+    let context = match Context::numbered(number) {
+        Ok(context) => context,
+        Err(e) => {
+            println!("{e}");
+            return;
+        }
+    };
+    println!("{} samples on {}\n", n, context.name);
+    println!("| kernel | device ms | device CPU ms | twin CPU ms | device |\n|---|---|---|---|---|");
+
+    let k = Kernels::new(&context);
+    let probe = context.zeros(4);
+    let rows = Rows { context: &context, probe: &probe };
+    let field = RadianceField::new(&NerfOptions::default().field);
+    let mut rng = mb_job::rng(0, 0);
+    let mut p = field.init(&mut rng);
+    let (grid, density, color) = field.parts();
+    // Samples along rays, as marching gives them.
+    let x: Vec<[f32; 3]> = (0..n.div_ceil(32))
+        .flat_map(|_| {
+            let from: [f32; 3] = std::array::from_fn(|_| rng.random());
+            let to: [f32; 3] = std::array::from_fn(|_| rng.random());
+            (0..32).map(move |i| std::array::from_fn(|d| from[d] + (to[d] - from[d]) * i as f32 / 32.0))
+        })
+        .take(n)
+        .collect();
+    let encoding = Encoding::new(&context, grid, &p.table, 0);
+    let stride = encoding.stride();
+    let positions = context.upload(x.as_flattened());
+    let features = context.zeros(n * stride);
+    let mut twin_features = vec![0.0; n * stride];
+    let traffic = (n * grid.levels() * 8 * grid.options().features * 4) as f64 / 1e9;
+    rows.row(
+        "hash encoding",
+        traffic,
+        "GB",
+        |work| encoding.forward(work, &k, Points { positions: &positions, count: n }, &features),
+        || grid.forward(&p.table.values, &x, grid.levels(), &mut twin_features, stride, 0),
+    );
+    let d: Vec<f32> = (0..n * stride).map(|_| rng.random_range(-1.0..1.0)).collect();
+    let d_features = context.upload(&d);
+    let mut grads = vec![0.0; grid.len()];
+    rows.row(
+        "its scatter",
+        2.0 * traffic,
+        "GB",
+        |work| encoding.scatter(work, &k, Points { positions: &positions, count: n }, &d_features, unit_of(1.0)),
+        || {
+            let batch = Scatter { positions: &x, d_features: &d, gradient: None, stride, first: 0 };
+            grid.scatter(&[batch], grid.levels(), &mut grads);
+        },
+    );
+    p.table.grads = grads;
+    rows.row(
+        "Adam of the table",
+        (grid.len() * 40) as f64 / 1e9,
+        "GB",
+        |work| encoding.step(work, &k, unit_of(1.0), &AdamStep { options: ADAM, lr: 1e-2, t: 1 }),
+        || p.table.step(&AdamOptions { skip_untouched: true, ..ADAM }, 1e-2, 1),
+    );
+    let networks: [(&str, &Mlp, _); 2] =
+        [("density network", density, &p.density), ("colour network", color, &p.color)];
+    for (name, mlp, parameters) in networks {
+        let mut network = Network::new(&context, mlp, parameters, false);
+        network.reserve(&context, n);
+        let input: Vec<f32> = (0..n * mlp.in_stride()).map(|_| rng.random_range(-1.0..1.0)).collect();
+        let d_out: Vec<f32> = (0..n * mlp.out_stride()).map(|_| rng.random_range(-1.0..1.0)).collect();
+        let (x, d) = (context.upload(&input), context.upload(&d_out));
+        let gflop = (2 * n * mlp.layout().map(|(inputs, outputs, ..)| inputs * outputs).sum::<usize>()) as f64 / 1e9;
+        let mut cache = MlpCache::default();
+        rows.row(
+            &format!("{name}, forward"),
+            gflop,
+            "GFLOP",
+            |work| network.forward(work, &k, &x, n),
+            || mlp.forward(&parameters.values, &input, mlp.in_stride(), n, &mut cache),
+        );
+        let transposed = mlp.transpose(&parameters.values);
+        let weights = Weights { parameters: &parameters.values, transposed: &transposed };
+        let mut grads = vec![0.0; mlp.buffer_len()];
+        rows.row(
+            &format!("{name}, backward"),
+            2.0 * gflop,
+            "GFLOP",
+            |work| network.backward(work, &k, &x, &d, n),
+            || mlp.backward(&weights, &input, mlp.in_stride(), &mut cache, &d_out, None, &mut grads, true),
+        );
+    }
+    surface_rows(&rows, &k, &x);
+}
+
+/// The geometry network of a distance field, whose normals a loss uses.
+fn surface_rows(rows: &Rows<'_>, k: &Kernels, x: &[[f32; 3]]) {
+    let (context, n) = (rows.context, x.len());
+    let mut rng = mb_job::rng(1, 0);
+    let field = SdfField::new(NeusOptions::default().field, &mut rng);
+    let parts = field.parts().expect("a field on a hash grid");
+    let (mlp, parameters) = parts.geometry;
+    let encoding = Encoding::new(context, parts.grid, parts.table, 3);
+    let mut network = Network::new(context, mlp, parameters, true);
+    network.reserve(context, n);
+    let stride = encoding.stride();
+    let (positions, encoded) = (context.upload(x.as_flattened()), context.zeros(n * stride));
+    let (normals, d_gradient) = (context.zeros(3 * n), context.zeros(n * stride));
+    let mut work = context.work();
+    encoding.forward(&mut work, k, Points { positions: &positions, count: n }, &encoded);
+    work.submit();
+    let (mut cache, transposed) = (MlpCache::default(), mlp.transpose(&parameters.values));
+    let weights = Weights { parameters: &parameters.values, transposed: &transposed };
+    let mut features = vec![0.0; n * stride];
+    parts.grid.forward(&parts.table.values, x, parts.grid.levels(), &mut features, stride, 3);
+    let mut found = vec![[0.0; 3]; n];
+    let products = (2 * n * mlp.layout().map(|(inputs, outputs, ..)| inputs * outputs).sum::<usize>()) as f64 / 1e9;
+    rows.row(
+        "geometry network, forward and normals",
+        products + (2 * n * mlp.shape().inputs * mlp.shape().width) as f64 / 1e9,
+        "GFLOP",
+        |work| {
+            network.forward(work, k, &encoded, n);
+            network.gradient(work, k, &encoded, n);
+            encoding.normals(work, k, Points { positions: &positions, count: n }, &network.gradient, &normals);
+        },
+        || {
+            mlp.forward(&parameters.values, &features, stride, n, &mut cache);
+            mlp.gradient(&weights, &mut cache);
+            let (table, levels) = (&parts.table.values, parts.grid.levels());
+            parts.grid.input_gradient(table, x, levels, &cache.gradient, stride, 3, &mut found);
+        },
+    );
+    let d_out: Vec<f32> = (0..n * mlp.out_stride()).map(|_| rng.random_range(-1.0..1.0)).collect();
+    let d_g = vec![0.1; n * stride];
+    let d = context.upload(&d_out);
+    let mut grads = vec![0.0; mlp.buffer_len()];
+    rows.row(
+        "geometry network, double backward",
+        4.0 * products,
+        "GFLOP",
+        |work| network.double_backward(work, k, &encoded, [&d, &d_gradient], n),
+        || mlp.backward(&weights, &features, stride, &mut cache, &d_out, Some(&d_g), &mut grads, true),
+    );
+}

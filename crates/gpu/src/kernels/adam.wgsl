@@ -1,0 +1,75 @@
+// Adam. Twin: `Parameters::step`.
+
+struct Sizes {
+    parameters: u32,
+    // `network`: partial sums of the gradient.
+    pieces: u32,
+    beta1: f32,
+    beta2: f32,
+    // lr / (1 - beta1^t).
+    rate: f32,
+    // 1 / sqrt(1 - beta2^t).
+    correction: f32,
+    epsilon: f32,
+    // `table`: one unit of the sums.
+    unit: f32,
+}
+
+@group(0) @binding(0) var<uniform> sizes: Sizes;
+@group(0) @binding(1) var<storage, read_write> values: array<f32>;
+@group(0) @binding(2) var<storage, read_write> m: array<f32>;
+@group(0) @binding(3) var<storage, read_write> v: array<f32>;
+// Gradient as whole numbers of 64 bits, low word first; cleared.
+@group(0) @binding(4) var<storage, read_write> sums: array<vec2<u32>>;
+// [pieces, parameters]
+@group(0) @binding(5) var<storage, read> partial_sums: array<f32>;
+
+fn update(i: u32, g: f32) {
+    let m_new = sizes.beta1 * m[i] + (1.0 - sizes.beta1) * g;
+    let v_new = sizes.beta2 * v[i] + (1.0 - sizes.beta2) * g * g;
+    m[i] = m_new;
+    v[i] = v_new;
+    values[i] -= sizes.rate * m_new / (sqrt(v_new) * sizes.correction + sizes.epsilon);
+}
+
+// The number of 64 bits, by its size and sign, so that nothing cancels.
+fn real(sum: vec2<u32>) -> f32 {
+    if sum.y < 0x80000000u {
+        return f32(sum.y) * 4294967296.0 + f32(sum.x);
+    }
+    let low = ~sum.x + 1u;
+    let high = ~sum.y + select(0u, 1u, low == 0u);
+    return -(f32(high) * 4294967296.0 + f32(low));
+}
+
+// One thread for a run of sixteen parameters: runs that no sample touched keep their values and moments.
+@compute @workgroup_size(64)
+fn table(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let first = (id.y * groups.x * 64u + id.x) * 16u;
+    let last = min(first + 16u, sizes.parameters);
+    var bits = 0u;
+    for (var i = first; i < last; i += 1u) {
+        bits |= sums[i].x | sums[i].y;
+    }
+    if bits == 0u {
+        return;
+    }
+    for (var i = first; i < last; i += 1u) {
+        update(i, real(sums[i]) * sizes.unit);
+        sums[i] = vec2(0u);
+    }
+}
+
+// One thread for each parameter.
+@compute @workgroup_size(64)
+fn network(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let i = id.y * groups.x * 64u + id.x;
+    if i >= sizes.parameters {
+        return;
+    }
+    var g = 0.0;
+    for (var piece = 0u; piece < sizes.pieces; piece += 1u) {
+        g += partial_sums[piece * sizes.parameters + i];
+    }
+    update(i, g);
+}

@@ -1,0 +1,146 @@
+// What lies between the two networks of a radiance field, and of a field of distance. Twins: `RadianceField`, `SdfField`.
+
+struct Sizes {
+    samples: u32,
+    // Cells a side of the occupancy grid.
+    resolution: u32,
+    // Of a distance field: samples that have a colour, the features that it gets, and row lengths of the geometry network's
+    // output, of its input and of the colour network's input.
+    colored: u32,
+    features: u32,
+    geometry_stride: u32,
+    encoded_stride: u32,
+    color_stride: u32,
+}
+
+@group(0) @binding(0) var<uniform> sizes: Sizes;
+// [rays, 20], see march.wgsl.
+@group(0) @binding(1) var<storage, read> rays: array<f32>;
+@group(0) @binding(2) var<storage, read> ray_of: array<u32>;
+// [samples, 3]
+@group(0) @binding(3) var<storage, read> positions: array<f32>;
+// [samples, 16]: what the density network gives; `join` writes its derivative. Of a distance field: [samples, geometry_stride].
+@group(0) @binding(4) var<storage, read_write> geometry: array<f32>;
+// [samples, 32]: what the colour network takes; `join` reads its derivative. Of a distance field: [colored, color_stride].
+@group(0) @binding(5) var<storage, read_write> color_in: array<f32>;
+// [samples]: density; `join` reads the derivative of output 0.
+@group(0) @binding(6) var<storage, read_write> sigma: array<f32>;
+// [cells]: bits of the largest density that a step found in each cell of the occupancy grid.
+@group(0) @binding(7) var<storage, read_write> seen: array<atomic<u32>>;
+// [samples, encoded_stride]: what the geometry network takes, the position in -1..1 first.
+@group(0) @binding(8) var<storage, read> encoded: array<f32>;
+// [samples, 3]: normals; `join_sdf` adds what the colour network asks of them.
+@group(0) @binding(9) var<storage, read_write> normals: array<f32>;
+
+@compute @workgroup_size(64)
+fn density(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let i = id.y * groups.x * 64u + id.x;
+    if i < sizes.samples {
+        sigma[i] = exp(clamp(geometry[16u * i] - 1.0, -15.0, 15.0));
+    }
+}
+
+@compute @workgroup_size(64)
+fn note(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let i = id.y * groups.x * 64u + id.x;
+    if i < sizes.samples {
+        let r = sizes.resolution;
+        let u = vec3(positions[3u * i], positions[3u * i + 1u], positions[3u * i + 2u]);
+        let c = min(vec3<u32>(max(u * f32(r), vec3(0.0))), vec3(r - 1u));
+        // Positive numbers are ordered as their bits are.
+        atomicMax(&seen[(c.z * r + c.y) * r + c.x], bitcast<u32>(sigma[i]));
+    }
+}
+
+// Real spherical harmonics of degree 0 to 3 of a sample's direction: `spherical_harmonics`.
+fn write_harmonics(i: u32, to: u32) {
+    let at = ray_of[i] * 20u + 3u;
+    let x = rays[at];
+    let y = rays[at + 1u];
+    let z = rays[at + 2u];
+    let xx = x * x;
+    let yy = y * y;
+    let zz = z * z;
+    color_in[to] = 0.2820948;
+    color_in[to + 1u] = -0.4886025 * y;
+    color_in[to + 2u] = 0.4886025 * z;
+    color_in[to + 3u] = -0.4886025 * x;
+    color_in[to + 4u] = 1.0925484 * x * y;
+    color_in[to + 5u] = -1.0925484 * y * z;
+    color_in[to + 6u] = 0.9461747 * zz - 0.31539157;
+    color_in[to + 7u] = -1.0925484 * x * z;
+    color_in[to + 8u] = 0.5462742 * (xx - yy);
+    color_in[to + 9u] = 0.5900436 * y * (yy - 3.0 * xx);
+    color_in[to + 10u] = 2.8906114 * x * y * z;
+    color_in[to + 11u] = 0.4570458 * y * (1.0 - 5.0 * zz);
+    color_in[to + 12u] = 0.37317633 * z * (5.0 * zz - 3.0);
+    color_in[to + 13u] = 0.4570458 * x * (1.0 - 5.0 * zz);
+    color_in[to + 14u] = 1.4453057 * z * (xx - yy);
+    color_in[to + 15u] = 0.5900436 * x * (3.0 * yy - xx);
+}
+
+@compute @workgroup_size(64)
+fn split(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let i = id.y * groups.x * 64u + id.x;
+    if i >= sizes.samples {
+        return;
+    }
+    let to = 32u * i;
+    for (var k = 0u; k < 16u; k += 1u) {
+        color_in[to + k] = geometry[16u * i + k];
+    }
+    write_harmonics(i, to + 16u);
+}
+
+@compute @workgroup_size(64)
+fn join(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let i = id.y * groups.x * 64u + id.x;
+    if i >= sizes.samples {
+        return;
+    }
+    for (var k = 0u; k < 16u; k += 1u) {
+        geometry[16u * i + k] = color_in[32u * i + k];
+    }
+    geometry[16u * i] += sigma[i];
+}
+
+// Position, normal, harmonics, features.
+@compute @workgroup_size(64)
+fn split_sdf(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let i = id.y * groups.x * 64u + id.x;
+    if i >= sizes.colored {
+        return;
+    }
+    let to = sizes.color_stride * i;
+    for (var d = 0u; d < 3u; d += 1u) {
+        color_in[to + d] = encoded[sizes.encoded_stride * i + d];
+        color_in[to + 3u + d] = normals[3u * i + d];
+    }
+    write_harmonics(i, to + 6u);
+    for (var k = 0u; k < sizes.features; k += 1u) {
+        color_in[to + 22u + k] = geometry[sizes.geometry_stride * i + 1u + k];
+    }
+}
+
+// `sigma` holds the derivative of the distance.
+@compute @workgroup_size(64)
+fn join_sdf(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let i = id.y * groups.x * 64u + id.x;
+    if i >= sizes.samples {
+        return;
+    }
+    let to = sizes.geometry_stride * i;
+    let has_color = i < sizes.colored;
+    for (var k = 0u; k < sizes.geometry_stride; k += 1u) {
+        var d = 0.0;
+        if has_color && k == 0u {
+            d = sigma[i];
+        } else if has_color && k <= sizes.features {
+            d = color_in[sizes.color_stride * i + 21u + k];
+        }
+        geometry[to + k] = d;
+    }
+    for (var d = 0u; d < 3u && has_color; d += 1u) {
+        normals[3u * i + d] += color_in[sizes.color_stride * i + 3u + d];
+    }
+}

@@ -1,0 +1,173 @@
+//! Training on a GPU: a [`mb_neural::device::Device`] over Vulkan, with WGSL kernels of our own.
+//!
+//! In: [`DeviceChoice`] and the options of a field. Out: the device that trains it. Only the feature `wgpu` brings in
+//! the driver; without it, a wish for a GPU ends with a sentence that says so.
+//!
+//! ```
+//! use mb_gpu::{DeviceChoice, device};
+//! let options = mb_neural::FieldOptions::preset("nerf", "fast", 0).expect("a known method");
+//! let device = device("cpu".parse::<DeviceChoice>().expect("a device"), &options).expect("always there");
+//! assert_eq!(device.name(), "the processor");
+//! ```
+//!
+//! Every kernel has a twin on the processor, to which the tests compare it. Sums that meet in one place are added as
+//! whole numbers or in a fixed order, so a run's result does not depend on the order of threads.
+//!
+//! Limits: `nerf` and `neus` of the preset `fast`, with fixed cameras; rendering and extraction run on the processor.
+
+use std::str::FromStr;
+
+use mb_job::{Error, Result};
+use mb_neural::device::{Device, Processor};
+use mb_neural::sdf_field::{DirectionEncoding, PositionEncoding};
+use mb_neural::{FieldOptions, Method};
+
+#[cfg(feature = "wgpu")]
+pub mod context;
+#[cfg(feature = "wgpu")]
+pub mod encoding;
+#[cfg(feature = "wgpu")]
+pub mod kernels;
+#[cfg(feature = "wgpu")]
+mod nerf;
+#[cfg(feature = "wgpu")]
+pub mod network;
+#[cfg(feature = "wgpu")]
+mod neus;
+#[cfg(feature = "wgpu")]
+mod radiance;
+#[cfg(feature = "wgpu")]
+mod rays;
+#[cfg(all(test, feature = "wgpu"))]
+mod tests;
+#[cfg(feature = "wgpu")]
+pub mod trained;
+
+/// Where to train.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DeviceChoice {
+    /// The first GPU, where there is one that knows the method; else the processor.
+    Auto,
+    /// The processor.
+    Cpu,
+    /// The GPU of this number, or the first one.
+    Gpu(Option<usize>),
+}
+
+impl FromStr for DeviceChoice {
+    type Err = String;
+
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
+        match text {
+            "auto" => Ok(Self::Auto),
+            "cpu" => Ok(Self::Cpu),
+            "gpu" => Ok(Self::Gpu(None)),
+            _ => text
+                .strip_prefix("gpu:")
+                .and_then(|number| number.parse().ok())
+                .map(|number| Self::Gpu(Some(number)))
+                .ok_or_else(|| format!("{text:?} is no device: auto, cpu, gpu or gpu:N")),
+        }
+    }
+}
+
+/// The device of a choice, for a run with these options.
+///
+/// # Errors
+/// A GPU is asked for, and this build, this machine or the method has none: what to do instead.
+pub fn device(choice: DeviceChoice, options: &FieldOptions) -> Result<Box<dyn Device>> {
+    match (choice, unsupported(options)) {
+        (DeviceChoice::Cpu, _) | (DeviceChoice::Auto, Some(_)) => Ok(Box::new(Processor)),
+        (DeviceChoice::Auto, None) => Ok(first_gpu().unwrap_or_else(|| Box::new(Processor))),
+        (DeviceChoice::Gpu(_), Some(why)) => Err(Error::Failed(format!("{why}. Use --device cpu"))),
+        (DeviceChoice::Gpu(number), None) => gpu(number),
+    }
+}
+
+/// Why no GPU can train it.
+fn unsupported(options: &FieldOptions) -> Option<&'static str> {
+    match &options.method {
+        _ if options.cameras.refine_poses || options.cameras.refine_focal => {
+            Some("a GPU cannot correct cameras in training yet")
+        }
+        Method::Nerf(_) => None,
+        Method::Neus(o)
+            if matches!(o.field.position, PositionEncoding::Hash(_))
+                && o.field.direction == DirectionEncoding::Harmonics
+                && o.field.skip.is_none()
+                && !o.field.weight_norm =>
+        {
+            None
+        }
+        _ => Some("a GPU trains only nerf and neus with the preset fast yet"),
+    }
+}
+
+#[cfg(not(feature = "wgpu"))]
+fn first_gpu() -> Option<Box<dyn Device>> {
+    None
+}
+
+#[cfg(not(feature = "wgpu"))]
+fn gpu(_number: Option<usize>) -> Result<Box<dyn Device>> {
+    Err(Error::Failed(
+        "this build has no GPU support: build it with `cargo build --release --features gpu`, or use --device cpu"
+            .to_owned(),
+    ))
+}
+
+#[cfg(feature = "wgpu")]
+fn first_gpu() -> Option<Box<dyn Device>> {
+    context::Context::first_hardware().map(|context| Box::new(Gpu(context.into())) as Box<dyn Device>)
+}
+
+#[cfg(feature = "wgpu")]
+fn gpu(number: Option<usize>) -> Result<Box<dyn Device>> {
+    Ok(Box::new(Gpu(context::Context::numbered(number)?.into())))
+}
+
+/// An open GPU.
+#[cfg(feature = "wgpu")]
+struct Gpu(std::sync::Arc<context::Context>);
+
+#[cfg(feature = "wgpu")]
+impl Device for Gpu {
+    fn name(&self) -> String {
+        self.0.name.clone()
+    }
+
+    fn model(
+        &self,
+        options: &FieldOptions,
+        data: &mb_neural::dataset::RayDataset,
+    ) -> Result<Box<dyn mb_neural::model::Model>> {
+        match (&options.method, unsupported(options)) {
+            (Method::Nerf(nerf), None) => {
+                let twin = mb_neural::nerf::Nerf::new(nerf.clone(), data);
+                Ok(Box::new(nerf::GpuNerf::new(twin, self.0.clone())))
+            }
+            (Method::Neus(neus), None) => {
+                let twin = mb_neural::neus::Neus::new(neus.clone(), data);
+                let model = neus::GpuNeus::new(twin, self.0.clone());
+                Ok(Box::new(model.ok_or_else(|| Error::Failed("the GPU lacks a part of this field".to_owned()))?))
+            }
+            (_, why) => Err(Error::Failed(format!("{}. Use --device cpu", why.unwrap_or("the GPU lacks the method")))),
+        }
+    }
+}
+
+#[cfg(test)]
+mod choices {
+    use super::*;
+
+    #[test]
+    fn devices_are_named_and_what_no_gpu_does_is_said() {
+        assert_eq!("auto".parse(), Ok(DeviceChoice::Auto));
+        assert_eq!("gpu:3".parse(), Ok(DeviceChoice::Gpu(Some(3))));
+        assert!("gpu:x".parse::<DeviceChoice>().is_err() && "".parse::<DeviceChoice>().is_err());
+        let dvgo = FieldOptions::preset("dvgo", "fast", 0).expect("a preset");
+        let Err(error) = device(DeviceChoice::Gpu(None), &dvgo) else { panic!("no GPU trains dvgo") };
+        assert!(error.to_string().contains("--device cpu"), "{error}");
+        assert_eq!(device(DeviceChoice::Auto, &dvgo).expect("the processor").name(), "the processor");
+    }
+}

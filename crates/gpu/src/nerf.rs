@@ -1,0 +1,202 @@
+//! `nerf --preset fast` on a device. Rays are drawn and the occupancy grid is kept on the processor, with the twin's random
+//! numbers; marching, the field, the loss, the derivatives and Adam run on the device.
+
+use std::sync::Arc;
+
+use mb_job::{Result, rng};
+use mb_neural::cameras::CameraResiduals;
+use mb_neural::dataset::{RayDataset, SceneRay};
+use mb_neural::model::{GROUPS, Level, Model, StepReport};
+use mb_neural::nerf::{DARK, Nerf};
+use mb_neural::occupancy::{CELL_MEMORY, OccupancyGrid, looks_everywhere};
+use rand::RngExt as _;
+
+use crate::context::{Buffer, Context};
+use crate::encoding::unit_of;
+use crate::kernels::Kernels;
+use crate::radiance::Radiance;
+use crate::rays::{RAY, Samples, Space, pack};
+
+/// A NeRF whose twin holds all that is not of the device, and, after a fetch, all that the device has learned.
+pub struct GpuNerf {
+    twin: Nerf,
+    context: Arc<Context>,
+    kernels: Kernels,
+    field: Radiance,
+    occupied: Buffer,
+    samples: Samples,
+    weights: Buffer,
+    losses: Buffer,
+}
+
+/// The cells that may hold something, as `march.wgsl` reads them.
+pub fn occupied(context: &Context, cells: &OccupancyGrid) -> Buffer {
+    context.upload(&cells.occupied().iter().map(|o| u32::from(*o)).collect::<Vec<_>>())
+}
+
+impl GpuNerf {
+    /// From its twin, which may have been trained.
+    pub fn new(twin: Nerf, context: Arc<Context>) -> Self {
+        let c = &*context;
+        Self {
+            kernels: Kernels::new(c),
+            field: Radiance::new(c, &twin.field, &twin.parameters, twin.options.occupancy),
+            occupied: occupied(c, &twin.occupancy),
+            samples: Samples::new(c),
+            weights: c.zeros(0),
+            losses: c.zeros(0),
+            twin,
+            context,
+        }
+    }
+
+    /// The rays of a step, as the twin draws them.
+    fn draw(&self, data: &RayDataset, cameras: &CameraResiduals, step: u64) -> Vec<[f32; RAY]> {
+        let options = &self.twin.options;
+        let (mut packed, mut rays) = (Vec::new(), Vec::new());
+        for group in 0..GROUPS as u64 {
+            let mut rng = rng(options.seed, step * GROUPS as u64 + group);
+            data.draw(&mut rng, self.twin.rays_of_group(), cameras, &mut rays);
+            packed.extend(rays.iter().map(|target| {
+                let background: [f32; 3] = std::array::from_fn(|_| rng.random());
+                let wanted = match target.mask.filter(|_| options.object_only) {
+                    Some(mask) => std::array::from_fn(|c| mask * target.rgb[c] + (1.0 - mask) * background[c]),
+                    None => target.rgb,
+                };
+                pack(target, rng.random(), background, wanted, options.near)
+            }));
+        }
+        packed
+    }
+
+    fn space(&self) -> Space {
+        let o = &self.twin.options;
+        Space { resolution: o.occupancy, far: o.far, step: o.step, cone: o.cone, inside_ball: false }
+    }
+
+    /// Forward, loss, backward and Adam; the losses stay in `self.losses`.
+    fn learn(&mut self, rays: &Buffer, count: usize, lr: f32, t: u64) {
+        let context = &*self.context;
+        let n = self.samples.len;
+        self.field.reserve(context, n);
+        context.reserve(&mut self.weights, n);
+        context.reserve(&mut self.losses, 2 * count);
+        let (k, f, s) = (&self.kernels, &self.field, &self.samples);
+        let mut work = context.work();
+        f.forward(&mut work, k, rays, s);
+        let scale = 1.0 / (3 * count) as f32;
+        let floats = [scale, self.twin.options.distortion, DARK].map(f32::to_bits);
+        let losses = [
+            (1, rays),
+            (2, &s.starts),
+            (3, &s.steps),
+            (4, &f.sigma),
+            (5, f.color.out()),
+            (6, &self.weights),
+            (7, &f.d_density),
+            (8, &f.d_color),
+            (9, &self.losses),
+        ];
+        work.run(&k.losses, &[count as u32, floats[0], floats[1], floats[2]], &losses, count);
+        let unit = unit_of(scale);
+        f.backward(&mut work, k, s, unit);
+        f.step(&mut work, k, unit, lr, t);
+        work.submit();
+    }
+
+    /// The `turn`-th refresh of the occupancy grid.
+    fn refresh_occupancy(&mut self, turn: u64) -> Result<()> {
+        let twin = &mut self.twin;
+        twin.occupancy.raise(&self.field.seen(&self.context)?);
+        let all = looks_everywhere(turn);
+        let (cells, points) = twin.occupancy.points_of_turn(twin.occupancy_seed(), turn, all);
+        let found = self.field.densities(&self.context, &self.kernels, &points)?;
+        twin.occupancy.remember(&cells, &found, CELL_MEMORY);
+        twin.occupancy.decide(twin.occupancy_threshold(turn));
+        self.occupied = occupied(&self.context, &twin.occupancy);
+        Ok(())
+    }
+}
+
+impl Model for GpuNerf {
+    fn name(&self) -> &'static str {
+        self.twin.name()
+    }
+
+    fn only_object(&self) -> bool {
+        self.twin.only_object()
+    }
+
+    fn iterations(&self) -> u64 {
+        self.twin.iterations()
+    }
+
+    fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
+        let packed = self.draw(data, cameras, step);
+        let count = packed.len();
+        let rays = self.context.upload(packed.as_flattened());
+        let space = self.space();
+        self.samples.march(&self.context, &self.kernels, &space, (&rays, count), &self.occupied)?;
+        let options = &self.twin.options;
+        let (lr, every) = (options.learning_rate * options.schedule.factor(step + 1), options.occupancy_every);
+        self.learn(&rays, count, lr, step + 1);
+        let losses: Vec<[f32; 2]> = self.context.read(&self.losses, count)?;
+        let sum = |i: usize| losses.iter().map(|l| f64::from(l[i])).sum::<f64>();
+        let mse = sum(0) / (3 * count) as f64;
+        let loss = mse + f64::from(self.twin.options.distortion) * sum(1) / count as f64;
+        self.twin.count_samples(self.samples.len, count);
+        if (step + 1).is_multiple_of(every) {
+            self.refresh_occupancy((step + 1) / every)?;
+        }
+        Ok(StepReport { loss, mse, rays: count, samples: self.samples.len })
+    }
+
+    fn fetch(&mut self) -> Result<()> {
+        self.twin.occupancy.raise(&self.field.seen(&self.context)?);
+        self.field.fetch(&self.context, &mut self.twin.parameters)
+    }
+
+    fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
+        self.twin.render(rays)
+    }
+
+    fn level(&self) -> Level {
+        self.twin.level()
+    }
+
+    fn surface(&self, positions: &[[f32; 3]]) -> Vec<f32> {
+        self.twin.surface(positions)
+    }
+
+    fn may_cross(&self, low: [f32; 3], high: [f32; 3]) -> bool {
+        self.twin.may_cross(low, high)
+    }
+
+    fn color_at(&self, positions: &[[f32; 3]], directions: &[[f32; 3]]) -> Vec<[f32; 3]> {
+        self.twin.color_at(positions, directions)
+    }
+
+    fn buffers(&mut self) -> Vec<&mut Vec<f32>> {
+        self.twin.buffers()
+    }
+
+    fn restored(&mut self, step: u64) -> std::result::Result<(), String> {
+        self.twin.restored(step)?;
+        let (context, twin) = (&*self.context, &self.twin);
+        self.field = Radiance::new(context, &twin.field, &twin.parameters, twin.options.occupancy);
+        self.occupied = occupied(context, &twin.occupancy);
+        Ok(())
+    }
+
+    fn is_finite(&self) -> bool {
+        self.twin.is_finite()
+    }
+
+    fn parameter_count(&self) -> usize {
+        self.twin.parameter_count()
+    }
+
+    fn bytes(&self) -> usize {
+        self.twin.bytes()
+    }
+}

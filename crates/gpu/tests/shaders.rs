@@ -1,0 +1,24 @@
+//! Every shader is valid, whatever this machine has: no device is asked.
+
+use naga::valid::{Capabilities, ValidationFlags, Validator};
+
+#[test]
+fn every_shader_is_valid_and_every_entry_point_has_the_same_workgroup() {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/src/kernels");
+    let mut entry_points = 0;
+    for file in std::fs::read_dir(folder).expect("the shaders") {
+        let path = file.expect("a file").path();
+        let source = std::fs::read_to_string(&path).expect("text");
+        let shown = path.display();
+        let module = naga::front::wgsl::parse_str(&source)
+            .unwrap_or_else(|e| panic!("{shown}: {}", e.emit_to_string_with_path(&source, &shown.to_string())));
+        Validator::new(ValidationFlags::all(), Capabilities::empty())
+            .validate(&module)
+            .unwrap_or_else(|e| panic!("{shown}: {}", e.emit_to_string_with_path(&source, &shown.to_string())));
+        for entry in &module.entry_points {
+            assert_eq!(entry.workgroup_size, [64, 1, 1], "{shown}: {}", entry.name);
+            entry_points += 1;
+        }
+    }
+    assert!(entry_points > 10);
+}
