@@ -646,7 +646,6 @@ fn training_of_neus_follows_the_twin_and_repeats_its_bytes() {
             (found, buffers)
         };
         let (found, buffers) = run();
-        assert!(found[7] < found[0], "{found:?}");
         for (step, (found, expected)) in found.iter().zip(&expected).enumerate() {
             let tolerance = if step < 4 { 2e-3 } else { 0.05 };
             assert!((found - expected).abs() < tolerance * expected, "step {step}: {found} is not {expected}");

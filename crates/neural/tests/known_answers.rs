@@ -89,12 +89,13 @@ fn small_neus() -> NeusOptions {
     options.field.width = 32;
     options.field.color_width = 32;
     options.learning_rate = 5e-3;
-    options.mask = 0.5;
     options.longest_step = 0.06;
     options.shortest_step = 0.015;
     options.first_levels = 2;
     options.sharpness_learning_rate = 3e-3;
-    options.with_iterations(800)
+    // Twenty views of a smooth ball say little about its middle; the outline says more.
+    options.mask = 0.3;
+    options.with_iterations(2400)
 }
 
 /// Trains without correcting cameras.
@@ -140,10 +141,8 @@ fn a_sphere_comes_back_within_one_percent_of_its_size() {
     assert!(off * 50 < radii.len(), "{off} of {} vertices lie more than 2 % of the diameter off", radii.len());
 }
 
-/// After so short a run the middle of a flat face lies up to half a millimetre too deep; a wrong derivative or frame would
-/// lose the box altogether.
 #[test]
-fn a_box_comes_back_within_two_percent_of_its_size() {
+fn a_box_comes_back_within_one_percent_of_its_size() {
     let half = Vector3::new(0.06, 0.045, 0.03);
     let mesh = surface_of(photographs(20, cuboid(half)));
     // Each face: the mean of the vertices near its middle.
@@ -162,7 +161,7 @@ fn a_box_comes_back_within_two_percent_of_its_size() {
             near.iter().sum::<f64>() / near.len() as f64
         };
         let size = side(1.0) - side(-1.0);
-        assert!((size / (2.0 * half[axis]) - 1.0).abs() < 0.02, "axis {axis}: {size} is not {}", 2.0 * half[axis]);
+        assert!((size / (2.0 * half[axis]) - 1.0).abs() < 0.01, "axis {axis}: {size} is not {}", 2.0 * half[axis]);
     }
 }
 
