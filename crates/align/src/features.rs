@@ -1,6 +1,9 @@
 //! Scale-invariant features of photographs: Lowe's detector and descriptor.
 
+use std::ops::{Range, RangeInclusive};
+
 use mb_image::RgbImage;
+use multiversion::multiversion;
 use nalgebra::{Matrix3, Point2, Vector3};
 
 use crate::scale_space::{Octave, Plane, base_plane, next_octave};
@@ -50,6 +53,7 @@ pub fn detect_features(photograph: &RgbImage, options: &FeatureOptions) -> Vec<F
     // Pixels of the photograph per pixel of the octave.
     let mut pixel_size = if options.upsample { 0.5 } else { 1.0 };
     let mut features = Vec::new();
+    let mut gradients = Gradients::default();
     while let Some(base) = octave {
         let scales = Octave::new(base);
         let mut found = extrema(&scales, options);
@@ -59,8 +63,8 @@ pub fn detect_features(photograph: &RgbImage, options: &FeatureOptions) -> Vec<F
             found.truncate(options.most);
         }
         for extremum in found {
-            for angle in orientations(&scales, &extremum) {
-                features.push(describe(&scales, &extremum, angle, pixel_size));
+            for angle in orientations(&scales, &extremum, &mut gradients) {
+                features.push(describe(&scales, &extremum, angle, pixel_size, &mut gradients));
             }
         }
         octave = next_octave(&scales);
@@ -100,13 +104,26 @@ fn extrema(octave: &Octave, options: &FeatureOptions) -> Vec<Extremum> {
         return found;
     }
     let threshold = 0.5 * options.contrast;
-    for s in 1..=Octave::SCALES {
-        for y in BORDER..height - BORDER {
-            let (lower, upper) = (octave.planes[s].row(y), octave.planes[s + 1].row(y));
-            for x in BORDER..width - BORDER {
-                let value = upper[x] - lower[x];
-                if value.abs() > threshold
-                    && is_extremum(octave, s, x, y, value)
+    // Of each difference of planes the last three rows, row y at y modulo 3.
+    let mut layers: [[Vec<f32>; 3]; Octave::SCALES + 2] =
+        std::array::from_fn(|_| std::array::from_fn(|_| vec![0.0; width]));
+    let mut marks = vec![false; width];
+    for below in BORDER - 1..=height - BORDER {
+        for (s, rows) in layers.iter_mut().enumerate() {
+            difference(&mut rows[below % 3], octave.planes[s + 1].row(below), octave.planes[s].row(below));
+        }
+        let y = below - 1;
+        if y < BORDER {
+            continue;
+        }
+        let rows = |layer: usize| [y - 1, y, y + 1].map(|y| layers[layer][y % 3].as_slice());
+        for s in 1..=Octave::SCALES {
+            let (here, others) = (rows(s), [rows(s - 1), rows(s + 1)]);
+            mark_plane_extrema(&mut marks, here, threshold);
+            for x in marked(&marks[BORDER..width - BORDER]).map(|x| BORDER + x) {
+                let (value, sign) = (here[1][x], here[1][x].signum());
+                let mut near = others.iter().flatten().flat_map(|row| &row[x - 1..=x + 1]);
+                if near.all(|v| sign * v <= sign * value)
                     && let Some(extremum) = locate(octave, s, x, y, options)
                 {
                     found.push(extremum);
@@ -117,14 +134,39 @@ fn extrema(octave: &Octave, options: &FeatureOptions) -> Vec<Extremum> {
     found
 }
 
-fn is_extremum(octave: &Octave, s: usize, x: usize, y: usize, value: f32) -> bool {
-    let sign = value.signum();
-    // Its own plane first: most candidates fail there.
-    [s, s - 1, s + 1].into_iter().all(|layer| {
-        (y - 1..=y + 1).all(|v| {
-            (x - 1..=x + 1).all(|u| (layer, v, u) == (s, y, x) || sign * octave.dog(layer, u, v) <= sign * value)
-        })
-    })
+#[multiversion(targets("x86_64+avx2"))]
+fn difference(out: &mut [f32], upper: &[f32], lower: &[f32]) {
+    for (out, (upper, lower)) in out.iter_mut().zip(upper.iter().zip(lower)) {
+        *out = upper - lower;
+    }
+}
+
+/// Marks where the middle one of three rows is beyond the threshold and no neighbour in them outdoes it. The rows' ends
+/// are left alone.
+#[multiversion(targets("x86_64+avx2"))]
+fn mark_plane_extrema(marks: &mut [bool], rows: [&[f32]; 3], threshold: f32) {
+    let n = marks.len();
+    let [above, here, below] = rows.map(|row| &row[..n]);
+    // Without the care for what is no number that `f32::max` takes.
+    let higher = |a: f32, b: f32| if a > b { a } else { b };
+    let lower = |a: f32, b: f32| if a < b { a } else { b };
+    for x in 1..n - 1 {
+        let value = here[x];
+        let mut highest = higher(here[x - 1], here[x + 1]);
+        let mut lowest = lower(here[x - 1], here[x + 1]);
+        for row in [above, below] {
+            highest = higher(higher(highest, row[x - 1]), higher(row[x], row[x + 1]));
+            lowest = lower(lower(lowest, row[x - 1]), lower(row[x], row[x + 1]));
+        }
+        marks[x] = ((value > threshold) & (value >= highest)) | ((value < -threshold) & (value <= lowest));
+    }
+}
+
+/// Where the marks are; few are.
+fn marked(marks: &[bool]) -> impl Iterator<Item = usize> {
+    const BLOCK: usize = 32;
+    let blocks = marks.chunks(BLOCK).enumerate().filter(|(_, block)| block.contains(&true));
+    blocks.flat_map(|(i, block)| (0..block.len()).filter(|&j| block[j]).map(move |j| i * BLOCK + j))
 }
 
 /// The extremum of the quadratic through the neighbourhood (Brown and Lowe 2002), moved to a neighbour while it lies
@@ -180,22 +222,75 @@ fn locate(octave: &Octave, s: usize, x: usize, y: usize, options: &FeatureOption
     None
 }
 
+/// The gradients of a patch: as differences of brightness in x and y, then as lengths and directions.
+#[derive(Default)]
+struct Gradients {
+    dx: Vec<f32>,
+    dy: Vec<f32>,
+    /// What each counts for; [`Gradients::measure`] multiplies it by the length.
+    weights: Vec<f32>,
+    /// Radians from x towards y, in [0, 2 pi].
+    angles: Vec<f32>,
+}
+
+impl Gradients {
+    fn clear(&mut self) {
+        for values in [&mut self.dx, &mut self.dy, &mut self.weights, &mut self.angles] {
+            values.clear();
+        }
+    }
+
+    /// Adds those of columns `from..to` of a row, which must have neighbours on all sides.
+    fn add_row(&mut self, plane: &Plane, y: usize, columns: Range<usize>, weights: &[f32], by: f32) {
+        let Range { start, end } = columns;
+        let (above, here, below) = (&plane.row(y - 1)[start..end], plane.row(y), &plane.row(y + 1)[start..end]);
+        self.dx
+            .extend(here[start + 1..end + 1].iter().zip(&here[start - 1..end - 1]).map(|(right, left)| right - left));
+        self.dy.extend(below.iter().zip(above).map(|(below, above)| below - above));
+        self.weights.extend(weights.iter().map(|weight| weight * by));
+    }
+
+    fn measure(&mut self) {
+        self.angles.resize(self.dx.len(), 0.0);
+        lengths_and_angles(&mut self.weights, &mut self.angles, &self.dx, &self.dy);
+    }
+}
+
+#[multiversion(targets("x86_64+avx2"))]
+fn lengths_and_angles(weights: &mut [f32], angles: &mut [f32], dx: &[f32], dy: &[f32]) {
+    let n = weights.len();
+    let (angles, dx, dy) = (&mut angles[..n], &dx[..n], &dy[..n]);
+    for i in 0..n {
+        weights[i] *= (dx[i] * dx[i] + dy[i] * dy[i]).sqrt();
+        angles[i] = direction(dx[i], dy[i]);
+    }
+}
+
+/// What part of `-radius..=radius` about `at` has neighbours on both sides among `count` values.
+fn inside(at: isize, radius: isize, count: usize) -> RangeInclusive<isize> {
+    (-radius).max(1 - at)..=radius.min(count as isize - 2 - at)
+}
+
 /// Peaks of the histogram of gradient directions round the extremum that reach 80 % of the highest.
-fn orientations(octave: &Octave, e: &Extremum) -> Vec<f32> {
+fn orientations(octave: &Octave, e: &Extremum, gradients: &mut Gradients) -> Vec<f32> {
     const BINS: usize = 36;
     let sigma = 1.5 * octave.sigma(e.scale);
     let radius = (3.0 * sigma).round() as isize;
     let plane = octave.nearest_plane(e.scale);
-    let mut histogram = [0.0f32; BINS];
+    let (column, row) = (e.x.round() as isize, e.y.round() as isize);
     let window = window(radius, 0.0, sigma);
-    for (dy, down) in (-radius..=radius).zip(&window) {
-        for (dx, across) in (-radius..=radius).zip(&window) {
-            let Some((gx, gy)) = plane.gradient(e.x.round() as isize + dx, e.y.round() as isize + dy) else { continue };
-            let weight = across * down;
-            let angle = direction(gx, gy);
-            let bin = (angle / std::f32::consts::TAU * BINS as f32).round() as usize % BINS;
-            histogram[bin] += weight * (gx * gx + gy * gy).sqrt();
-        }
+    gradients.clear();
+    let across = inside(column, radius, plane.width);
+    let weights = &window[(across.start() + radius) as usize..=(across.end() + radius) as usize];
+    let columns = (column + across.start()) as usize..(column + across.end() + 1) as usize;
+    for dy in inside(row, radius, plane.height) {
+        gradients.add_row(plane, (row + dy) as usize, columns.clone(), weights, window[(dy + radius) as usize]);
+    }
+    gradients.measure();
+    let mut histogram = [0.0f32; BINS];
+    for (weight, angle) in gradients.weights.iter().zip(&gradients.angles) {
+        let bin = (angle * (BINS as f32 / std::f32::consts::TAU) + 0.5) as i32;
+        histogram[bin as usize % BINS] += weight;
     }
     let at = |i: isize| histogram[i.rem_euclid(BINS as isize) as usize];
     let smooth: [f32; BINS] = std::array::from_fn(|i| {
@@ -233,50 +328,52 @@ fn direction(x: f32, y: f32) -> f32 {
     if y < 0.0 { TAU - angle } else { angle }
 }
 
-fn describe(octave: &Octave, e: &Extremum, angle: f32, pixel_size: f64) -> Feature {
-    const CELLS: usize = 4;
-    const DIRECTIONS: usize = 8;
+/// Cells of a descriptor in a row, and in a column.
+const CELLS: usize = 4;
+/// Directions told apart in each cell.
+const DIRECTIONS: usize = 8;
+
+fn describe(octave: &Octave, e: &Extremum, angle: f32, pixel_size: f64, gradients: &mut Gradients) -> Feature {
     let plane = octave.nearest_plane(e.scale);
     let cell_px = 3.0 * octave.sigma(e.scale);
     let radius = (cell_px * std::f32::consts::SQRT_2 * (CELLS as f32 + 1.0) * 0.5).round() as isize;
     let (sin, cos) = angle.sin_cos();
+    let (cos, sin) = (cos / cell_px, sin / cell_px);
     let (column, row) = (e.x.round() as isize, e.y.round() as isize);
-    // One cell of margin on every side takes what falls outside.
-    let mut cells = [[[0.0f32; DIRECTIONS]; CELLS + 2]; CELLS + 2];
     // A Gaussian as wide as half of all cells (turning does not change it).
     let sigma = 0.5 * CELLS as f32 * cell_px;
     let (left, above) = (column as f32 - e.x, row as f32 - e.y);
     let (window_x, window_y) = (window(radius, left, sigma), window(radius, above, sigma));
-    for (dy, weight_y) in (-radius..=radius).zip(&window_y) {
-        for (dx, weight_x) in (-radius..=radius).zip(&window_x) {
-            let (px, py) = (dx as f32 + left, dy as f32 + above);
-            let u = (cos * px + sin * py) / cell_px;
-            let v = (cos * py - sin * px) / cell_px;
-            let (across, down) = (u + CELLS as f32 / 2.0 - 0.5, v + CELLS as f32 / 2.0 - 0.5);
-            let limit = CELLS as f32;
-            if across <= -1.0 || across >= limit || down <= -1.0 || down >= limit {
-                continue;
-            }
-            let Some((gx, gy)) = plane.gradient(column + dx, row + dy) else { continue };
-            let weight = weight_x * weight_y * (gx * gx + gy * gy).sqrt();
-            let turn = direction(gx, gy) - angle;
-            let turn = if turn < 0.0 { turn + std::f32::consts::TAU } else { turn };
-            let turn = turn / std::f32::consts::TAU * DIRECTIONS as f32;
-            let (c, r, o) = (across.floor(), down.floor(), turn.floor());
-            let (fc, fr, fo) = (across - c, down - r, turn - o);
-            for (i, row_share) in [(0, 1.0 - fr), (1, fr)] {
-                for (j, column_share) in [(0, 1.0 - fc), (1, fc)] {
-                    let cell = &mut cells[(r as isize + 1) as usize + i][(c as isize + 1) as usize + j];
-                    let share = weight * row_share * column_share;
-                    cell[o as usize % DIRECTIONS] += share * (1.0 - fo);
-                    cell[(o as usize + 1) % DIRECTIONS] += share * fo;
-                }
-            }
+    gradients.clear();
+    // Cells across and down, with one of margin on every side that takes what falls outside.
+    let reach = 0.5 * (CELLS as f32 + 1.0);
+    let (mut across, mut down) = (Vec::new(), Vec::new());
+    for dy in inside(row, radius, plane.height) {
+        let y = dy as f32 + above;
+        let within = inside(column, radius, plane.width);
+        let (first, last) = [(cos, sin * y), (-sin, cos * y)].into_iter().fold(
+            (*within.start(), *within.end()),
+            |(first, last), (slope, offset)| {
+                let (middle, half) = (-offset / slope, reach / slope.abs());
+                (first.max(-floor(half - middle + left)), last.min(floor(middle + half - left)))
+            },
+        );
+        if first > last {
+            continue;
         }
+        let columns = (column + first) as usize..(column + last + 1) as usize;
+        let weights = &window_x[(first + radius) as usize..=(last + radius) as usize];
+        gradients.add_row(plane, (row + dy) as usize, columns, weights, window_y[(dy + radius) as usize]);
+        let x = (first..=last).map(|dx| dx as i32 as f32 + left);
+        across.extend(x.clone().map(|x| cos * x + (sin * y + reach)));
+        down.extend(x.map(|x| cos * y + reach - sin * x));
     }
+    gradients.measure();
+    let mut cells = [[0.0f32; DIRECTIONS]; (CELLS + 2) * (CELLS + 2)];
+    share_among_cells(&mut cells, &mut across, &mut down, gradients, angle);
     let mut values = [0.0f32; 128];
     for (i, value) in values.iter_mut().enumerate() {
-        *value = cells[i / 32 + 1][i / 8 % 4 + 1][i % 8];
+        *value = cells[(i / 32 + 1) * (CELLS + 2) + i / 8 % CELLS + 1][i % 8];
     }
     let norm = values.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
     // No gradient counts for more than a fifth, so that changes of light do not dominate.
@@ -295,6 +392,57 @@ fn describe(octave: &Octave, e: &Extremum, angle: f32, pixel_size: f64) -> Featu
     }
 }
 
+/// The largest integer that is not above, without the call that `f32::floor` is on processors that lack the instruction.
+fn floor(value: f32) -> isize {
+    let toward_zero = value as i32;
+    toward_zero as isize - isize::from(toward_zero as f32 > value)
+}
+
+/// Adds each gradient to the four cells around it and the two directions beside its own, by nearness. `across` and `down`
+/// are places in cells; `angle` is the direction that counts as the first.
+#[multiversion(targets("x86_64+avx2"))]
+fn share_among_cells(
+    cells: &mut [[f32; DIRECTIONS]; (CELLS + 2) * (CELLS + 2)],
+    across: &mut [f32],
+    down: &mut [f32],
+    gradients: &mut Gradients,
+    angle: f32,
+) {
+    const STEP: f32 = std::f32::consts::TAU / DIRECTIONS as f32;
+    let n = across.len();
+    let down = &mut down[..n];
+    let (weights, turns) = (&gradients.weights[..n], &mut gradients.angles[..n]);
+    let mut firsts = vec![(0i32, 0i32); n];
+    for i in 0..n {
+        let turn = turns[i] - angle;
+        let turn = if turn < 0.0 { turn + std::f32::consts::TAU } else { turn } / STEP;
+        // Rounding may put a place outside by a hair.
+        let last = CELLS as i32;
+        let (column, row) = ((across[i] as i32).clamp(0, last), (down[i] as i32).clamp(0, last));
+        let direction = (turn as i32).clamp(0, DIRECTIONS as i32 - 1);
+        across[i] -= column as f32;
+        down[i] -= row as f32;
+        turns[i] = turn - direction as f32;
+        firsts[i] = (row * (last + 2) + column, direction);
+    }
+    for i in 0..n {
+        let (first, direction) = (firsts[i].0 as usize, firsts[i].1 as usize % DIRECTIONS);
+        let block: &mut [[f32; DIRECTIONS]; CELLS + 4] =
+            (&mut cells[first..first + CELLS + 4]).try_into().expect("8 cells");
+        let next = (direction + 1) % DIRECTIONS;
+        let (right, below) = (across[i], down[i]);
+        let lower = weights[i] * below;
+        let upper = weights[i] - lower;
+        let (upper_right, lower_right) = (upper * right, lower * right);
+        let shares = [upper - upper_right, upper_right, lower - lower_right, lower_right];
+        for (cell, share) in [0, 1, CELLS + 2, CELLS + 3].into_iter().zip(shares) {
+            let later = share * turns[i];
+            block[cell][direction] += share - later;
+            block[cell][next] += later;
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -310,5 +458,29 @@ mod tests {
             assert!(off.min(std::f32::consts::TAU - off) < 1e-5, "{i}: {} is not {expected}", direction(x, y));
         }
         assert_eq!(direction(0.0, 0.0), 0.0);
+    }
+
+    #[test]
+    fn marks_are_what_a_look_at_every_neighbour_says() {
+        let rows: [Vec<f32>; 3] =
+            std::array::from_fn(|r| (0..83).map(|x| ((x * 31 + r * 17) * 7919 % 23) as f32 / 11.0 - 1.0).collect());
+        let mut marks = vec![false; 83];
+        mark_plane_extrema(&mut marks, rows.each_ref().map(Vec::as_slice), 0.3);
+        for x in 1..82 {
+            let value = rows[1][x];
+            let near = || rows.iter().flat_map(|row| &row[x - 1..=x + 1]);
+            let outstanding = near().all(|v| *v <= value) || near().all(|v| *v >= value);
+            assert_eq!(marks[x], value.abs() > 0.3 && outstanding, "{x}");
+        }
+        let places: Vec<usize> = (0..83).filter(|&x| marks[x]).collect();
+        assert!(places.len() > 5, "{places:?}");
+        assert_eq!(marked(&marks).collect::<Vec<_>>(), places);
+    }
+
+    #[test]
+    fn floors_of_both_signs() {
+        for (value, expected) in [(2.0, 2), (2.9, 2), (0.0, 0), (-0.1, -1), (-2.0, -2), (-2.1, -3)] {
+            assert_eq!(floor(value), expected, "{value}");
+        }
     }
 }

@@ -31,29 +31,6 @@ impl Plane {
         self.data[y * self.width + x]
     }
 
-    /// Central differences; `None` at the border.
-    pub fn gradient(&self, x: isize, y: isize) -> Option<(f32, f32)> {
-        if x < 1 || y < 1 || x + 1 >= self.width as isize || y + 1 >= self.height as isize {
-            return None;
-        }
-        let (x, y) = (x as usize, y as usize);
-        Some((self.at(x + 1, y) - self.at(x - 1, y), self.at(x, y + 1) - self.at(x, y - 1)))
-    }
-
-    /// Twice the size, bilinear; pixel (2x, 2y) lies on pixel (x, y).
-    fn doubled(&self) -> Self {
-        let (width, height) = (2 * self.width, 2 * self.height);
-        let mut data = Vec::with_capacity(width * height);
-        for y in 0..height {
-            let (above, below) = (self.row(y / 2), self.row((y / 2 + y % 2).min(self.height - 1)));
-            for x in 0..width {
-                let (left, right) = (x / 2, (x / 2 + x % 2).min(self.width - 1));
-                data.push(0.25 * (above[left] + above[right] + below[left] + below[right]));
-            }
-        }
-        Self { width, height, data }
-    }
-
     /// Every second pixel.
     fn halved(&self) -> Self {
         let (width, height) = (self.width / 2, self.height / 2);
@@ -63,52 +40,119 @@ impl Plane {
 
     /// Blurred by a Gaussian; the border's pixels continue outside.
     fn blurred(&self, sigma: f32) -> Self {
-        let radius = (4.0 * sigma).ceil() as usize;
-        let mut kernel: Vec<f32> =
-            (0..=2 * radius).map(|i| (-((i as f32 - radius as f32) / sigma).powi(2) / 2.0).exp()).collect();
-        let sum: f32 = kernel.iter().sum();
-        kernel.iter_mut().for_each(|k| *k /= sum);
-        let (width, height) = (self.width, self.height);
-        let mut across = vec![0.0f32; width * height];
-        let mut padded = vec![0.0f32; width + 2 * radius];
-        for (y, out) in across.chunks_exact_mut(width).enumerate() {
-            let row = self.row(y);
-            padded[..radius].fill(row[0]);
-            padded[radius..radius + width].copy_from_slice(row);
-            padded[radius + width..].fill(row[width - 1]);
-            weighted_sum(out, &kernel, |k| &padded[k..k + width]);
-        }
+        let kernel = gaussian(sigma);
+        let (width, height, radius) = (self.width, self.height, kernel.len() / 2);
         let mut data = vec![0.0f32; width * height];
+        let mut padded = Padded::new(width, radius);
         for (y, out) in data.chunks_exact_mut(width).enumerate() {
-            weighted_sum(out, &kernel, |k| {
-                let y = (y + k).saturating_sub(radius).min(height - 1);
-                &across[y * width..(y + 1) * width]
-            });
+            weighted_sum(padded.row(), &kernel, &self.rows_about(y, radius, radius));
+            weighted_sum(out, &kernel, &padded.shifted(kernel.len(), 0));
         }
         Self { width, height, data }
     }
-}
 
-/// The sum of rows, each with its weight of a symmetric kernel of odd length; `row(k)` is the row of weight `k`.
-fn weighted_sum<'a>(out: &mut [f32], kernel: &[f32], row: impl Fn(usize) -> &'a [f32]) {
-    let radius = kernel.len() / 2;
-    scale(out, row(radius), kernel[radius]);
-    for k in 0..radius {
-        add_pair(out, row(k), row(2 * radius - k), kernel[k]);
+    /// Twice the size, bilinear, pixel (2x, 2y) on pixel (x, y), and then blurred by a Gaussian; both at once.
+    fn doubled_and_blurred(&self, sigma: f32) -> Self {
+        let (even, odd) = polyphase(&gaussian(sigma));
+        let (width, height, radius) = (self.width, self.height, even.len() / 2);
+        let mut data = vec![0.0f32; 4 * width * height];
+        let mut padded = Padded::new(width, radius);
+        let (mut on, mut between) = (vec![0.0f32; width], vec![0.0f32; width]);
+        for (y, out) in data.chunks_exact_mut(4 * width).enumerate() {
+            let (upper, lower) = out.split_at_mut(2 * width);
+            for (out, kernel, above) in [(upper, &even, radius), (lower, &odd, radius - 1)] {
+                weighted_sum(padded.row(), kernel, &self.rows_about(y, above, kernel.len() - 1 - above));
+                weighted_sum(&mut on, &even, &padded.shifted(even.len(), 0));
+                weighted_sum(&mut between, &odd, &padded.shifted(odd.len(), 1));
+                for (out, (a, b)) in out.chunks_exact_mut(2).zip(on.iter().zip(&between)) {
+                    (out[0], out[1]) = (*a, *b);
+                }
+            }
+        }
+        Self { width: 2 * width, height: 2 * height, data }
+    }
+
+    /// Row `y` with so many above and below it; the border's rows continue outside.
+    fn rows_about(&self, y: usize, above: usize, below: usize) -> Vec<&[f32]> {
+        (0..=above + below).map(|k| self.row((y + k).saturating_sub(above).min(self.height - 1))).collect()
     }
 }
 
-#[multiversion(targets("x86_64+avx2"))]
-fn scale(out: &mut [f32], row: &[f32], weight: f32) {
-    for (o, p) in out.iter_mut().zip(row) {
-        *o = weight * p;
+/// A Gaussian at the integers up to four deviations, its sum one.
+fn gaussian(sigma: f32) -> Vec<f32> {
+    let radius = (4.0 * sigma).ceil() as usize;
+    let mut kernel: Vec<f32> =
+        (0..=2 * radius).map(|i| (-((i as f32 - radius as f32) / sigma).powi(2) / 2.0).exp()).collect();
+    let sum: f32 = kernel.iter().sum();
+    kernel.iter_mut().for_each(|k| *k /= sum);
+    kernel
+}
+
+/// Linear interpolation to twice as many values, then `kernel` (odd length), as two kernels on the values that were
+/// there: for a value on one of them (odd length), and for the one between it and the next (one shorter).
+fn polyphase(kernel: &[f32]) -> (Vec<f32>, Vec<f32>) {
+    let radius = kernel.len() as isize / 2;
+    // The furthest neighbour that either touches.
+    let reach = radius / 2 + 1;
+    let phase = |to: isize, first: isize| {
+        let mut phase = vec![0.0f32; (reach - first + 1) as usize];
+        for (k, weight) in kernel.iter().enumerate() {
+            let at = to + k as isize - radius;
+            let (left, right) = (at.div_euclid(2), (at + 1).div_euclid(2));
+            phase[(left - first) as usize] += 0.5 * weight;
+            phase[(right - first) as usize] += 0.5 * weight;
+        }
+        phase
+    };
+    (phase(0, -reach), phase(1, 1 - reach))
+}
+
+/// A row whose first and last values continue outside it.
+struct Padded {
+    width: usize,
+    radius: usize,
+    data: Vec<f32>,
+}
+
+impl Padded {
+    fn new(width: usize, radius: usize) -> Self {
+        Self { width, radius, data: vec![0.0; width + 2 * radius] }
+    }
+
+    /// The row itself, to be written.
+    fn row(&mut self) -> &mut [f32] {
+        &mut self.data[self.radius..self.radius + self.width]
+    }
+
+    /// The row shifted `count` times by one, so that what lies `radius - first` to the left comes first.
+    fn shifted(&mut self, count: usize, first: usize) -> Vec<&[f32]> {
+        let (width, radius) = (self.width, self.radius);
+        let (left, right) = (self.data[radius], self.data[radius + width - 1]);
+        self.data[..radius].fill(left);
+        self.data[radius + width..].fill(right);
+        (first..first + count).map(|k| &self.data[k..k + width]).collect()
     }
 }
 
+/// The sum of rows, each with its weight.
 #[multiversion(targets("x86_64+avx2"))]
-fn add_pair(out: &mut [f32], a: &[f32], b: &[f32], weight: f32) {
-    for ((o, a), b) in out.iter_mut().zip(a).zip(b) {
-        *o += weight * (a + b);
+fn weighted_sum(out: &mut [f32], weights: &[f32], rows: &[&[f32]]) {
+    /// Sums that are held in registers.
+    const BLOCK: usize = 32;
+    let (blocks, rest) = out.as_chunks_mut::<BLOCK>();
+    for (i, out) in blocks.iter_mut().enumerate() {
+        let mut sums = [0.0f32; BLOCK];
+        for (row, weight) in rows.iter().zip(weights) {
+            let row = &row[i * BLOCK..(i + 1) * BLOCK];
+            for (sum, value) in sums.iter_mut().zip(row) {
+                *sum += weight * value;
+            }
+        }
+        *out = sums;
+    }
+    let done = blocks.len() * BLOCK;
+    for (i, out) in rest.iter_mut().enumerate() {
+        *out = rows.iter().zip(weights).map(|(row, weight)| weight * row[done + i]).sum();
     }
 }
 
@@ -152,11 +196,50 @@ impl Octave {
 /// The first octave's base.
 pub(crate) fn base_plane(grey: &Plane, upsample: bool) -> Plane {
     let more = |has: f32| (BASE_SIGMA.powi(2) - has.powi(2)).sqrt();
-    if upsample { grey.doubled().blurred(more(2.0 * CAMERA_SIGMA)) } else { grey.blurred(more(CAMERA_SIGMA)) }
+    if upsample { grey.doubled_and_blurred(more(2.0 * CAMERA_SIGMA)) } else { grey.blurred(more(CAMERA_SIGMA)) }
 }
 
 /// The base of the next octave; `None` when it would be too small to hold a feature.
 pub(crate) fn next_octave(octave: &Octave) -> Option<Plane> {
     let twice = &octave.planes[Octave::SCALES];
     (twice.width.min(twice.height) >= 24).then(|| twice.halved())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn doubling_and_blurring_at_once_is_one_after_the_other() {
+        let (width, height) = (41, 29);
+        let brightness = |i: usize| (i * 7919 % 251) as f32 / 250.0;
+        let grey = Plane { width, height, data: (0..width * height).map(brightness).collect() };
+        let mut doubled = Plane { width: 2 * width, height: 2 * height, data: Vec::new() };
+        for (y, x) in (0..2 * height).flat_map(|y| (0..2 * width).map(move |x| (y, x))) {
+            let (right, below) = ((x.div_ceil(2)).min(width - 1), (y.div_ceil(2)).min(height - 1));
+            let corners = [(x / 2, y / 2), (right, y / 2), (x / 2, below), (right, below)];
+            doubled.data.push(corners.iter().map(|&(x, y)| grey.at(x, y)).sum::<f32>() / 4.0);
+        }
+        // Kernels of even and of odd radius.
+        for sigma in [0.9, 1.2, 1.6] {
+            let (at_once, expected) = (grey.doubled_and_blurred(sigma), doubled.blurred(sigma));
+            assert_eq!((at_once.width, at_once.height), (2 * width, 2 * height));
+            for (i, (a, b)) in at_once.data.iter().zip(&expected.data).enumerate() {
+                assert!((a - b).abs() < 1e-6, "sigma {sigma}, pixel {i}: {a} is not {b}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_blurred_step_is_the_error_function() {
+        let (width, height) = (80, 3);
+        let data = (0..width * height).map(|i| if i % width < 40 { 0.0 } else { 1.0 }).collect();
+        let sigma = 3.0;
+        let blurred = Plane { width, height, data }.blurred(sigma);
+        // The Gaussian's integral at -1.5, -0.5, 0.5 and 1.5 pixels from the step, in deviations of 3 pixels.
+        for (x, expected) in [(38, 0.30854), (39, 0.43382), (40, 0.56618), (41, 0.69146)] {
+            assert!((blurred.at(x, 1) - expected).abs() < 1e-3, "{x}: {}", blurred.at(x, 1));
+        }
+        assert!(blurred.at(0, 0).abs() < 1e-6 && (blurred.at(79, 2) - 1.0).abs() < 1e-6);
+    }
 }
