@@ -28,11 +28,17 @@ impl Dropped {
 
 impl std::fmt::Display for Dropped {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(
-            f,
-            "{} vertices that are not finite, {} triangles at them, {} faces with fewer than three corners",
-            self.vertices, self.triangles, self.faces
-        )
+        let counted = |count: usize, one: &str, many: &str| match count {
+            0 => None,
+            1 => Some(format!("1 {one}")),
+            n => Some(format!("{n} {many}")),
+        };
+        let parts = [
+            counted(self.vertices, "vertex that is not finite", "vertices that are not finite"),
+            counted(self.triangles, "triangle at such a vertex", "triangles at such vertices"),
+            counted(self.faces, "face with fewer than three corners", "faces with fewer than three corners"),
+        ];
+        f.write_str(&parts.into_iter().flatten().collect::<Vec<_>>().join(", "))
     }
 }
 

@@ -214,7 +214,7 @@ fn vertices_that_are_no_numbers_are_dropped_and_counted_or_refused() {
     assert_eq!(mesh.triangles, [[0, 1, 2]]);
     assert_eq!(mesh.vertices[2], Point3::new(0.0, 1.0, 0.0));
     let strict = read_mesh(&path).unwrap_err().to_string();
-    assert!(strict.contains("1 vertices that are not finite"), "{strict}");
+    assert!(strict.contains("1 vertex that is not finite, 1 triangle at such a vertex, 1 face with fewer"), "{strict}");
     let path = file(&dir, "all.ply", text("nan 0 0\n0 inf 0\n1 0 -inf\n0 nan 0\n"));
     assert!(complaint(&path).contains("no vertex has finite coordinates"));
 }
@@ -269,6 +269,39 @@ fn a_file_of_another_kind_is_refused() {
     let renamed = dir.path().join("mesh.dat");
     std::fs::rename(&path, &renamed).unwrap();
     assert_eq!(read_mesh(&renamed).unwrap(), sample());
+}
+
+/// Open3D writes the buffer into the JSON chunk.
+#[test]
+fn a_glb_file_may_carry_its_buffer_as_text() {
+    use base64::prelude::*;
+    let dir = folder();
+    let positions: Vec<u8> = [[0.0f32, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.5, 0.0]]
+        .as_flattened()
+        .iter()
+        .flat_map(|v| v.to_le_bytes())
+        .collect();
+    let glb = |uri: &str| {
+        let mut json = format!(
+            r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],"nodes":[{{"mesh":0}}],
+            "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}}}}]}}],
+            "accessors":[{{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3"}}],
+            "bufferViews":[{{"buffer":0,"byteLength":36}}],"buffers":[{{"byteLength":36,"uri":"{uri}"}}]}}"#
+        );
+        json.extend(std::iter::repeat_n(' ', json.len().next_multiple_of(4) - json.len()));
+        let mut out = b"glTF\x02\0\0\0".to_vec();
+        out.extend((20 + json.len() as u32).to_le_bytes());
+        out.extend((json.len() as u32).to_le_bytes());
+        out.extend(*b"JSON");
+        out.extend(json.bytes());
+        out
+    };
+    let text = BASE64_STANDARD.encode(positions);
+    let mesh = read_mesh(file(&dir, "text.glb", glb(&format!("data:application/octet-stream;base64,{text}")))).unwrap();
+    assert_eq!(mesh.triangle(0), [[0., 0., 0.], [2., 0., 0.], [0., 0.5, 0.]].map(Point3::from));
+    let damaged = glb(&format!("data:application/octet-stream;base64,{}*", &text[1..]));
+    assert!(complaint(&file(&dir, "damaged.glb", damaged)).contains("damaged"));
+    assert!(complaint(&file(&dir, "elsewhere.glb", glb("mesh.bin"))).contains("outside the file"));
 }
 
 #[test]

@@ -1,7 +1,10 @@
 //! Reading GLB files.
 
+use std::borrow::Cow;
 use std::path::Path;
 
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
 use mb_job::{InputError, Result};
 use nalgebra::{Matrix4, Point3, Quaternion, UnitQuaternion, Vector3};
 use serde_json::Value;
@@ -19,7 +22,8 @@ const MAX_ITEMS: usize = 1 << 28;
 
 /// Reads all triangles of the default scene, with node transforms applied: `COLOR_0` as vertex colours, the material's
 /// base colour as triangle colours, and each node with a mesh as a part where there are several. Textures, skins and
-/// animations are passed over; compressed (Draco, meshopt) and external data is an error.
+/// animations are passed over; compressed (Draco, meshopt) and external data is an error, a buffer inside the JSON chunk
+/// (a `data:` URI, as Open3D writes) is not.
 pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<(TriangleMesh, Dropped)> {
     let glb = Glb::open(path, bytes)?;
     let scene = &glb.json["scenes"][glb.json["scene"].as_u64().unwrap_or(0) as usize];
@@ -52,10 +56,10 @@ fn array(value: &Value) -> &[Value] {
 struct Glb<'a> {
     path: &'a Path,
     json: Value,
-    bin: &'a [u8],
+    bin: Cow<'a, [u8]>,
 }
 
-/// A view of numbers in the binary chunk.
+/// A view of numbers in the buffer.
 struct Accessor<'a> {
     bytes: &'a [u8],
     component: u64,
@@ -94,7 +98,17 @@ impl<'a> Glb<'a> {
             let found = format!("the file needs the extension {required}, which cannot be read");
             return Err(InputError::new(path, found).help("Export it without compression").into());
         }
-        Ok(Self { path, json, bin: chunk(BIN_CHUNK).unwrap_or_default() })
+        let inline = match json["buffers"][0]["uri"].as_str().and_then(|uri| uri.strip_prefix("data:")) {
+            Some(data) => {
+                let (_, encoded) =
+                    data.split_once(";base64,").ok_or_else(|| bad("the buffer in the JSON chunk is not in base64"))?;
+                let decoded = BASE64_STANDARD.decode(encoded);
+                Some(decoded.map_err(|e| bad(&format!("the buffer in the JSON chunk is damaged ({e})")))?)
+            }
+            None => None,
+        };
+        let bin = inline.map_or_else(|| Cow::Borrowed(chunk(BIN_CHUNK).unwrap_or_default()), Cow::Owned);
+        Ok(Self { path, json, bin })
     }
 
     /// Adds (mesh, transform) of a node and its children.
@@ -192,7 +206,7 @@ impl<'a> Glb<'a> {
         Ok(())
     }
 
-    fn accessor(&self, index: &Value) -> std::result::Result<Accessor<'a>, String> {
+    fn accessor(&self, index: &Value) -> std::result::Result<Accessor<'_>, String> {
         let bad = || "an accessor is missing or damaged".to_owned();
         let accessor = array(&self.json["accessors"]).get(index.as_u64().ok_or_else(bad)? as usize).ok_or_else(bad)?;
         if !accessor["sparse"].is_null() {
@@ -200,7 +214,8 @@ impl<'a> Glb<'a> {
         }
         let view = accessor["bufferView"].as_u64().ok_or_else(bad)?;
         let view = array(&self.json["bufferViews"]).get(view as usize).ok_or_else(bad)?;
-        if view["buffer"].as_u64() != Some(0) || !self.json["buffers"][0]["uri"].is_null() {
+        let is_outside = |uri: &str| !uri.starts_with("data:");
+        if view["buffer"].as_u64() != Some(0) || self.json["buffers"][0]["uri"].as_str().is_some_and(is_outside) {
             return Err("the data lies outside the file".to_owned());
         }
         let component = accessor["componentType"].as_u64().ok_or_else(bad)?;
