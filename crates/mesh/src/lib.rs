@@ -10,6 +10,7 @@ mod kd_tree;
 mod obj;
 mod ply;
 mod poisson_disk;
+mod radix;
 mod sample;
 mod stl;
 mod surface;

@@ -5,8 +5,8 @@
 
 use mb_geometry::Aabb;
 use nalgebra::Point3;
-use rayon::prelude::*;
 
+use crate::radix::sorted_by_key;
 use crate::{TriangleMesh, sample_uniform};
 
 /// Uniform samples per wanted point, from which the points are chosen (Open3D's `init_factor`).
@@ -34,46 +34,28 @@ pub fn sample_poisson_disk(mesh: &TriangleMesh, n: usize, seed: u64) -> Vec<Poin
 fn eliminate(candidates: &[Point3<f64>], n: usize, reach: f64) -> Vec<Point3<f64>> {
     let ratio = n as f64 / candidates.len() as f64;
     let floor = BETA * (1.0 - ratio.powf(GAMMA));
-    let (mut order, mut grid) = Grid::new(candidates, reach);
+    let (mut order, grid) = Grid::new(candidates, reach);
+    let mut crowd = Crowd::new(grid, floor);
     let count = order.len();
-    // Enough for what is left of the grid later, too.
-    let mut room = grid.room();
-    let weights: Vec<f64> = (0..count)
-        .into_par_iter()
-        .with_min_len(4096)
-        .map_init(
-            || room.clone(),
-            |room, i| {
-                let weight = grid.near(i, room).iter().fold(0.0, |sum, near| sum + crowding(near.squared, floor));
-                // The point itself is no neighbour.
-                weight - crowding(0.0, floor)
-            },
-        )
-        .collect();
-    for (point, weight) in grid.points.iter_mut().zip(weights) {
-        point.weight = weight;
-    }
-
     let mut surplus = count.saturating_sub(n);
     // Few are removed in the order of the whole surface, which jumps through memory.
     while surplus > count / SHARE_IN_ORDER {
         // No more points than the surplus are more crowded than this, and removals only make it fewer.
-        let Some(limit) = nth_largest_weight(&grid.points, surplus) else { break };
-        let removed = grid.remove_above(limit, floor, &mut room);
+        let Some(limit) = nth_largest_weight(&crowd.points, surplus) else { break };
+        let removed = crowd.remove_above(limit);
         if removed == 0 {
             break;
         }
         surplus -= removed;
-        grid.compact(&mut order);
+        crowd.compact(&mut order);
     }
-    let mut queue = Queue::new(&grid.points);
+    let mut queue = Queue::new(&crowd.points);
     for _ in 0..surplus {
-        let Some(i) = queue.pop_most_crowded(&grid.points) else { break };
-        let near = grid.near(i as usize, &mut room);
-        remove(&mut grid.points, i as usize, near, floor);
+        let Some(i) = queue.pop_most_crowded(&crowd.points) else { break };
+        crowd.remove(i as usize);
     }
     let mut survivors: Vec<u32> =
-        order.into_iter().zip(&grid.points).filter(|(_, point)| !point.is_removed()).map(|(i, _)| i).collect();
+        order.into_iter().zip(&crowd.points).filter(|(_, point)| !point.is_removed()).map(|(i, _)| i).collect();
     survivors.sort_unstable();
     survivors.into_iter().map(|i| candidates[i as usize]).collect()
 }
@@ -187,14 +169,6 @@ impl Candidate {
     }
 }
 
-/// A point within the reach of another.
-#[derive(Clone, Copy, Default)]
-struct Near {
-    /// Squared distance in reaches, below 1.
-    squared: f64,
-    point: u32,
-}
-
 /// (1 - d / reach)^8 from the squared distance in reaches, 0 beyond the reach.
 #[inline]
 fn crowding(squared: f64, floor: f64) -> f64 {
@@ -210,8 +184,9 @@ fn crowding(squared: f64, floor: f64) -> f64 {
 /// points are stored, sorted by z, y, x: three cells in a row along x are one run of points.
 struct Grid {
     /// Points in cell order, in units of the reach, from the corner of the grid.
-    points: Vec<Candidate>,
-    cell_of_point: Vec<u32>,
+    points: Vec<[f64; 3]>,
+    /// First point of each cell, and the number of points.
+    starts: Vec<u32>,
     /// For each cell, the nine runs of points (first, end) in the cells around it.
     runs: Vec<[(u32, u32); 9]>,
 }
@@ -231,18 +206,15 @@ impl Grid {
             let cell = in_reaches(p).map(|v| (v * cells_per_reach) as u64 + 1);
             cell.z << (2 * AXIS_BITS) | cell.y << AXIS_BITS | cell.x
         };
-        let mut sorted: Vec<(u64, u32)> = points.par_iter().enumerate().map(|(i, p)| (key_of(p), i as u32)).collect();
-        sorted.par_sort_unstable();
+        let sorted = sorted_by_key(points.iter().enumerate().map(|(i, p)| (key_of(p), i as u32)).collect());
 
         let mut keys = Vec::new();
         let mut starts = Vec::new();
-        let mut cell_of_point = Vec::with_capacity(points.len());
         for (at, &(key, _)) in sorted.iter().enumerate() {
             if keys.last() != Some(&key) {
                 keys.push(key);
                 starts.push(at as u32);
             }
-            cell_of_point.push(keys.len() as u32 - 1);
         }
         starts.push(points.len() as u32);
 
@@ -264,31 +236,93 @@ impl Grid {
             }
         }
         let order: Vec<u32> = sorted.into_iter().map(|(_, i)| i).collect();
-        let points =
-            order.iter().map(|&i| Candidate { at: in_reaches(&points[i as usize]).into(), weight: 0.0 }).collect();
-        (order, Self { points, cell_of_point, runs })
+        let points = order.iter().map(|&i| in_reaches(&points[i as usize]).into()).collect();
+        (order, Self { points, starts, runs })
+    }
+}
+
+/// Points, and who crowds whom.
+struct Crowd {
+    points: Vec<Candidate>,
+    /// Where each point's numbers in `near` end.
+    ends: Vec<usize>,
+    /// Point after point the numbers of all points within its reach, itself included, ascending.
+    near: Vec<u32>,
+    /// Neighbours nearer than this, in reaches, crowd no more than at this distance.
+    floor: f64,
+}
+
+impl Crowd {
+    fn new(grid: Grid, floor: f64) -> Self {
+        let axes: [Vec<f64>; 3] = std::array::from_fn(|axis| grid.points.iter().map(|p| p[axis]).collect());
+        let mut crowd = Self {
+            points: grid.points.into_iter().map(|at| Candidate { at, weight: 0.0 }).collect(),
+            ends: Vec::with_capacity(axes[0].len()),
+            // Random points of a surface have some 18 of the candidates in reach.
+            near: Vec::with_capacity(20 * axes[0].len()),
+            floor,
+        };
+        let mut cells = Neighbourhood::default();
+        for (cell, runs) in grid.starts.windows(2).zip(&grid.runs) {
+            cells.gather(runs, &axes);
+            for i in cell[0] as usize..cell[1] as usize {
+                let weights = cells.weights_around(&crowd.points[i].at, floor, &mut crowd.near);
+                // The point itself is no neighbour.
+                crowd.points[i].weight = weights.iter().fold(0.0, |sum, w| sum + w) - crowding(0.0, floor);
+                crowd.ends.push(crowd.near.len());
+            }
+        }
+        crowd
+    }
+
+    /// Numbers of the points within reach of point `i`, itself included.
+    fn near(&self, i: usize) -> &[u32] {
+        let first = if i == 0 { 0 } else { self.ends[i - 1] };
+        &self.near[first..self.ends[i]]
+    }
+
+    /// Takes point `i` away; those near it are less crowded.
+    fn remove(&mut self, i: usize) {
+        let [x, y, z] = self.points[i].at;
+        let first = if i == 0 { 0 } else { self.ends[i - 1] };
+        for &near in &self.near[first..self.ends[i]] {
+            let near = &mut self.points[near as usize];
+            let (dx, dy, dz) = (near.at[0] - x, near.at[1] - y, near.at[2] - z);
+            near.weight -= crowding(dx * dx + dy * dy + dz * dz, self.floor);
+        }
+        self.points[i].weight = f64::NEG_INFINITY;
     }
 
     /// Forgets the points that were removed, in `order` too: what is left is near in memory again.
     fn compact(&mut self, order: &mut Vec<u32>) {
-        let mut kept_before = Vec::with_capacity(self.points.len() + 1);
-        kept_before.push(0);
-        let mut kept = 0;
+        const GONE: u32 = u32::MAX;
+        let mut count = 0;
+        let number = |point: &Candidate| {
+            let number = if point.is_removed() { GONE } else { count };
+            count += u32::from(!point.is_removed());
+            number
+        };
+        let numbers: Vec<u32> = self.points.iter().map(number).collect();
+        let (mut kept, mut first, mut kept_near) = (0, 0, 0);
         for i in 0..self.points.len() {
-            if !self.points[i].is_removed() {
+            let end = self.ends[i];
+            if numbers[i] != GONE {
+                for at in first..end {
+                    let number = numbers[self.near[at] as usize];
+                    self.near[kept_near] = number;
+                    kept_near += usize::from(number != GONE);
+                }
                 self.points[kept] = self.points[i];
-                self.cell_of_point[kept] = self.cell_of_point[i];
+                self.ends[kept] = kept_near;
                 order[kept] = order[i];
                 kept += 1;
             }
-            kept_before.push(kept as u32);
+            first = end;
         }
         self.points.truncate(kept);
-        self.cell_of_point.truncate(kept);
+        self.ends.truncate(kept);
+        self.near.truncate(kept_near);
         order.truncate(kept);
-        for (first, end) in self.runs.as_flattened_mut() {
-            (*first, *end) = (kept_before[*first as usize], kept_before[*end as usize]);
-        }
     }
 
     /// Removes the most crowded point until none is above `limit`; returns how many went.
@@ -296,7 +330,7 @@ impl Grid {
     /// The result is that of removing them in the order of their weights. Weights only ever fall, and fall only where a
     /// neighbour goes; so a point with no more crowded neighbour goes before all of them, whatever happens elsewhere. The
     /// points are visited where they lie, and each waits for its more crowded neighbours: all is near in memory.
-    fn remove_above(&mut self, limit: f64, floor: f64, room: &mut [Near]) -> usize {
+    fn remove_above(&mut self, limit: f64) -> usize {
         let mut removed = 0;
         let mut waiting = Vec::new();
         for start in 0..self.points.len() {
@@ -307,19 +341,18 @@ impl Grid {
                     waiting.pop();
                     continue;
                 }
-                let near = self.near(i, room);
-                // Of equal ones the lowest number counts as more crowded.
-                let mut most = (weight, i);
-                for point in near.iter().map(|near| near.point as usize) {
-                    let weight = self.points[point].weight;
-                    if weight > most.0 || (weight == most.0 && point < most.1) {
-                        most = (weight, point);
-                    }
-                }
-                if most.1 != i {
-                    waiting.push(most.1);
+                // In two passes: a guess which of the weights is larger would be wrong too often.
+                let weight_of = |near: u32| self.points[near as usize].weight;
+                let most = self.near(i).iter().fold(weight, |most, &near| {
+                    let weight = weight_of(near);
+                    if weight > most { weight } else { most }
+                });
+                // Of equal ones the lowest number counts as more crowded. The point itself is among them.
+                let first = self.near(i).iter().copied().find(|&near| weight_of(near) == most).unwrap_or(i as u32);
+                if first as usize != i {
+                    waiting.push(first as usize);
                 } else {
-                    remove(&mut self.points, i, near, floor);
+                    self.remove(i);
                     removed += 1;
                     waiting.pop();
                 }
@@ -327,37 +360,80 @@ impl Grid {
         }
         removed
     }
+}
 
-    /// Room for the points that [`Grid::near`] looks at.
-    fn room(&self) -> Vec<Near> {
-        let around = |runs: &[(u32, u32); 9]| runs.iter().map(|(first, end)| (end - first) as usize).sum();
-        vec![Near::default(); self.runs.iter().map(around).max().unwrap_or(0) + 1]
-    }
+/// The points of 27 cells side by side, axis by axis, as the processor likes to compare them; and room to do it.
+#[derive(Default)]
+struct Neighbourhood {
+    axes: [Vec<f64>; 3],
+    numbers: Vec<u32>,
+    squares: Vec<f64>,
+    found: Vec<u32>,
+    weights: Vec<f64>,
+}
 
-    /// The points within reach of point `i`, itself included, by number.
-    fn near<'a>(&self, i: usize, room: &'a mut [Near]) -> &'a [Near] {
-        let [x, y, z] = self.points[i].at;
-        let mut count = 0;
-        for (first, end) in self.runs[self.cell_of_point[i] as usize] {
-            for (point, p) in (first..end).zip(&self.points[first as usize..end as usize]) {
-                let (dx, dy, dz) = (p.at[0] - x, p.at[1] - y, p.at[2] - z);
-                let squared = dx * dx + dy * dy + dz * dz;
-                // Always written, and kept where it counts: a guess would be wrong too often.
-                room[count] = Near { squared, point };
-                count += usize::from(squared < 1.0);
-            }
+impl Neighbourhood {
+    /// Collects the points of some runs from their coordinates, axis by axis.
+    fn gather(&mut self, runs: &[(u32, u32)], from: &[Vec<f64>; 3]) {
+        self.numbers.clear();
+        self.numbers.extend(runs.iter().flat_map(|&(first, end)| first..end));
+        for (axis, from) in self.axes.iter_mut().zip(from) {
+            axis.clear();
+            runs.iter().for_each(|&(first, end)| axis.extend_from_slice(&from[first as usize..end as usize]));
         }
-        &room[..count]
+        let count = self.numbers.len();
+        // What fills up the last group of lanes is out of everyone's reach.
+        self.squares.clear();
+        self.squares.resize(count.next_multiple_of(LANES), f64::INFINITY);
+        self.found.resize(self.squares.len(), 0);
+        self.weights.resize(self.squares.len(), 0.0);
+    }
+
+    /// How much each point within reach of `at` crowds it, itself included, by number; the numbers go to `near`.
+    fn weights_around(&mut self, at: &[f64; 3], floor: f64, near: &mut Vec<u32>) -> &[f64] {
+        let [xs, ys, zs] = &self.axes;
+        for (((squared, x), y), z) in self.squares.iter_mut().zip(xs).zip(ys).zip(zs) {
+            let (dx, dy, dz) = (x - at[0], y - at[1], z - at[2]);
+            *squared = dx * dx + dy * dy + dz * dz;
+        }
+        let mut count = 0;
+        for (first, squares) in (0..).step_by(LANES).zip(self.squares.as_chunks::<LANES>().0) {
+            let inside = squares.iter().rev().fold(0, |bits, &squared| 2 * bits + usize::from(squared < 1.0));
+            // Four are always written, and those inside stay: a guess would be wrong too often.
+            self.found[count..count + LANES].copy_from_slice(&SET_LANES[inside].map(|lane| first + lane));
+            count += inside.count_ones() as usize;
+        }
+        let (found, weights) = (&mut self.found[..count], &mut self.weights[..count]);
+        for (found, weight) in found.iter_mut().zip(&mut *weights) {
+            *weight = self.squares[*found as usize];
+            *found = self.numbers[*found as usize];
+        }
+        weights.iter_mut().for_each(|w| *w = crowding(*w, floor));
+        near.extend_from_slice(found);
+        weights
     }
 }
 
-/// Takes point `i` away; those near it are less crowded.
-fn remove(points: &mut [Candidate], i: usize, near: &[Near], floor: f64) {
-    for near in near {
-        points[near.point as usize].weight -= crowding(near.squared, floor);
+/// Points that are compared at a time.
+const LANES: usize = 4;
+
+/// For each set of lanes, as bits, its lanes from the lowest on.
+const SET_LANES: [[u32; LANES]; 1 << LANES] = {
+    let mut table = [[0; LANES]; 1 << LANES];
+    let mut set = 0;
+    while set < table.len() {
+        let (mut lane, mut count) = (0, 0);
+        while lane < LANES {
+            if set >> lane & 1 == 1 {
+                table[set][count] = lane as u32;
+                count += 1;
+            }
+            lane += 1;
+        }
+        set += 1;
     }
-    points[i].weight = f64::NEG_INFINITY;
-}
+    table
+};
 
 #[cfg(test)]
 mod tests {

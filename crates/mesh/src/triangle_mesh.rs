@@ -26,11 +26,13 @@ impl TriangleMesh {
     }
 
     /// The corners of triangle `index`.
+    #[inline]
     pub fn triangle(&self, index: usize) -> [Point3<f64>; 3] {
         self.triangles[index].map(|v| self.vertices[v as usize])
     }
 
     /// Twice the area of triangle `index` times its unit normal.
+    #[inline]
     pub fn scaled_normal(&self, index: usize) -> Vector3<f64> {
         let [a, b, c] = self.triangle(index);
         (b - a).cross(&(c - a))

@@ -30,6 +30,20 @@ struct Block {
     to: [i64; 3],
 }
 
+impl Block {
+    /// The smallest block that holds some voxels, at least one.
+    fn around(voxels: impl IntoIterator<Item = [i64; 3]>) -> Self {
+        let mut block = Self { from: [i64::MAX; 3], to: [i64::MIN; 3] };
+        for voxel in voxels {
+            for axis in 0..3 {
+                block.from[axis] = block.from[axis].min(voxel[axis]);
+                block.to[axis] = block.to[axis].max(voxel[axis]);
+            }
+        }
+        block
+    }
+}
+
 enum Kind {
     Visible,
     Hidden,
@@ -69,18 +83,20 @@ impl<'a> Clipper<'a> {
             whole: Vec<u32>,
             cut: Vec<(u32, [Point3<f64>; 3])>,
         }
+        // A vertex has some six triangles: its voxel is looked up once.
+        let voxels: Vec<[i32; 3]> =
+            mesh.vertices.par_iter().map(|p| self.index_of(&self.voxel_of(p)).map(|i| i as i32)).collect();
         let clip_chunk = |chunk: usize| {
             let mut rest = Rest::default();
             let mut pieces = Vec::new();
             for t in chunk * CHUNK..((chunk + 1) * CHUNK).min(mesh.triangles.len()) {
-                let corners = mesh.triangle(t);
-                let polygon: Vec<Vector3<f64>> = corners.iter().map(|p| self.voxel_of(p)).collect();
-                let block = self.block_of(&polygon);
+                let block = Block::around(mesh.triangles[t].map(|v| voxels[v as usize].map(i64::from)));
                 match self.kind(&block) {
                     Kind::Visible => rest.whole.push(t as u32),
                     Kind::Hidden => {}
                     Kind::Mixed => {
                         pieces.clear();
+                        let polygon = mesh.triangle(t).map(|p| self.voxel_of(&p)).to_vec();
                         self.cut(polygon, block, &mut pieces);
                         for polygon in &pieces {
                             let at = |i: usize| self.point_of(&polygon[i]);
@@ -135,16 +151,10 @@ impl<'a> Clipper<'a> {
         self.volume.min_pt_in_world + voxel * self.volume.voxel_size_m
     }
 
-    /// The voxels that a polygon's box touches.
-    fn block_of(&self, polygon: &[Vector3<f64>]) -> Block {
-        let bound = |axis: usize, fold: fn(f64, f64) -> f64, start: f64| {
-            let extreme = polygon.iter().map(|v| v[axis]).fold(start, fold);
-            ((extreme + 0.5).floor() as i64).clamp(-1, self.volume.resolutions[axis] as i64)
-        };
-        Block {
-            from: std::array::from_fn(|axis| bound(axis, f64::min, f64::INFINITY)),
-            to: std::array::from_fn(|axis| bound(axis, f64::max, f64::NEG_INFINITY)),
-        }
+    /// The voxel that holds a point.
+    fn index_of(&self, voxel: &Vector3<f64>) -> [i64; 3] {
+        let along = |axis: usize| ((voxel[axis] + 0.5).floor() as i64).clamp(-1, self.volume.resolutions[axis] as i64);
+        [0, 1, 2].map(along)
     }
 
     fn kind(&self, block: &Block) -> Kind {
@@ -192,7 +202,7 @@ impl<'a> Clipper<'a> {
                             half_block.from[axis] = middle + 1;
                         }
                         // The half may touch fewer voxels than its block, but by rounding also none of them.
-                        let touched = self.block_of(&half);
+                        let touched = Block::around(half.iter().map(|v| self.index_of(v)));
                         for a in 0..3 {
                             half_block.from[a] = half_block.from[a].max(touched.from[a]).min(half_block.to[a]);
                             half_block.to[a] = half_block.to[a].min(touched.to[a]).max(half_block.from[a]);
