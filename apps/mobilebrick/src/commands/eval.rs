@@ -244,7 +244,8 @@ impl Views {
         let perceptual = lpips.as_ref().map(|l| l as &dyn PerceptualMetric);
         let line = |images: usize, psnr: f64, ssim: f64, lpips: Option<f64>| {
             let lpips = lpips.map_or_else(|| "not computed: give --lpips-weights".to_owned(), |v| format!("{v:.4}"));
-            format!("{images} images: PSNR {psnr:.2} dB, SSIM {ssim:.4}, LPIPS {lpips}")
+            let images = if images == 1 { "1 image".to_owned() } else { format!("{images} images") };
+            format!("{images}: PSNR {psnr:.2} dB, SSIM {ssim:.4}, LPIPS {lpips}")
         };
         if let Some(method) = self.method {
             let list = self.list.read()?;

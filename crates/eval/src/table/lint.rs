@@ -33,7 +33,8 @@ pub fn lint(table: &Table) -> Vec<ImpossibleRow> {
         else {
             continue;
         };
-        let half = 0.5 * 0.1f64.powi(column.digits as i32);
+        let digits = column.digits;
+        let half = 0.5 * 0.1f64.powi(digits as i32);
         for row in &table.rows {
             let (Some(accuracy), Some(recall), Some(value)) =
                 (row.values[accuracy_at], row.values[recall_at], row.values[f1_at])
@@ -48,8 +49,8 @@ pub fn lint(table: &Table) -> Vec<ImpossibleRow> {
                     value,
                     bound,
                     reason: format!(
-                        "the mean of F1 over sequences cannot exceed the F1 of the means: {value} > {bound:.2} \
-                         for accuracy {accuracy} and recall {recall}"
+                        "the mean of F1 over sequences cannot exceed the F1 of the means: {value:.digits$} > {bound:.2} \
+                         for accuracy {accuracy:.digits$} and recall {recall:.digits$}"
                     ),
                 });
             }
@@ -82,6 +83,15 @@ mod tests {
         assert_eq!(found.len(), 1, "{found:?}");
         assert_eq!((found[0].method.as_str(), found[0].value), ("BNV-Fusion", 33.27));
         assert!((found[0].bound - 32.02).abs() < 0.01, "{}", found[0].bound);
+    }
+
+    #[test]
+    fn the_sentence_has_the_digits_of_the_table() {
+        let mut table = PaperTable::Surfaces.published();
+        table.rows.truncate(1);
+        table.rows[0].values[..3].copy_from_slice(&[Some(100.0), Some(50.800999999999995), Some(95.0)]);
+        let reason = &lint(&table)[0].reason;
+        assert!(reason.ends_with("95.00 > 67.38 for accuracy 100.00 and recall 50.80"), "{reason}");
     }
 
     #[test]

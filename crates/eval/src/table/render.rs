@@ -56,9 +56,11 @@ impl Table {
 
     fn csv(&self) -> String {
         let line = |cells: Vec<String>| cells.iter().map(|c| quoted(c)).collect::<Vec<_>>().join(",") + "\n";
+        // What scaling to per cent adds behind the tenth digit is no part of the number.
+        let number = |v: f64| ((v * 1e10).round() / 1e10).to_string();
         let mut csv = line(self.headings().into_iter().map(str::to_owned).collect());
         for row in &self.rows {
-            let numbers = row.values.iter().map(|v| v.map(|v| v.to_string()).unwrap_or_default());
+            let numbers = row.values.iter().map(|v| v.map(number).unwrap_or_default());
             let words = [&row.method, &row.input, &row.origin].into_iter().cloned();
             csv += &line(words.chain(numbers).collect());
         }
@@ -183,6 +185,9 @@ mod tests {
         assert!(markdown.contains("| a_b |  | us, here | **1.0** | **2.0** |"), "{markdown}");
         assert!(markdown.contains("| c<d |  | us, here | **1.0** |  |"), "{markdown}");
         assert_eq!(table.render(TableFormat::Csv).lines().nth(2), Some("c<d,,\"us, here\",1.01,"));
+        let mut scaled = table.clone();
+        scaled.rows[0].values[0] = Some(99.77250000000001);
+        assert_eq!(scaled.render(TableFormat::Csv).lines().nth(1), Some("a_b,,\"us, here\",99.7725,2"));
         assert!(table.render(TableFormat::Latex).contains("a\\_b &  & us, here & \\textbf{1.0} & \\textbf{2.0} \\\\"));
         assert!(table.render(TableFormat::Latex).contains("up \\%"));
         assert!(table.render(TableFormat::Html).contains("<td>c&lt;d</td>"));
