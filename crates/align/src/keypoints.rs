@@ -176,7 +176,13 @@ fn estimate(
     // Residual lengths of right clicks have a root mean square of the noise times the root of 2.
     let noise_rms_px = std::f64::consts::SQRT_2 * options.click_noise_px;
     let agreeing = exact.inliers.iter().filter(|i| **i).count();
-    let bears_out = exact.rms_px <= 1.5 * noise_rms_px && 4 * agreeing >= 3 * correspondences.len();
+    // A frame most of whose clicks are left out has drifted: a person does not click one photograph wrong throughout.
+    let lost = (0..cameras.len()).any(|camera| {
+        let clicks = correspondences.iter().zip(&exact.inliers).filter(|(c, _)| c.camera_idx == camera);
+        let (agree, differ): (Vec<_>, Vec<_>) = clicks.partition(|(_, inlier)| **inlier);
+        differ.len() >= 2 && differ.len() > agree.len()
+    });
+    let bears_out = exact.rms_px <= 1.5 * noise_rms_px && 4 * agreeing >= 3 * correspondences.len() && !lost;
     if bears_out || cameras.len() < 2 || options.drift_deg <= 0.0 || options.drift_mm <= 0.0 {
         return Ok((exact, false));
     }

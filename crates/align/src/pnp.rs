@@ -409,30 +409,78 @@ impl Problem<'_> {
                 }
             }
         }
-        let (mut pose, score) = best.filter(|(_, score)| score.is_finite())?;
+        let (pose, score) = best.filter(|(_, score)| score.is_finite())?;
 
         // Small samples make the median too small (Rousseeuw and Leroy 1987, p. 202).
         let small_sample = 1.0 + 5.0 / (points as f64 - 5.0);
-        let mut sigma = (score / RAYLEIGH_MEDIAN * small_sample).max(options.click_noise_px);
-        let mut inliers = self.within(&pose, RAYLEIGH_LIMIT * sigma);
+        let sigma = (score / RAYLEIGH_MEDIAN * small_sample).max(options.click_noise_px);
+        let inliers = self.within(&pose, RAYLEIGH_LIMIT * sigma);
+        let fit = self.settle(Fit { pose, inliers, limit_px: RAYLEIGH_LIMIT * sigma }, options)?;
+        match self.with_drifted_cameras(&fit) {
+            Some(inliers) => self.settle(Fit { inliers, ..fit }, options),
+            None => Some(fit),
+        }
+    }
+
+    /// Polishes a pose and chooses the clicks that agree with it, in turn, until these stay.
+    fn settle(&self, fit: Fit, options: &PnpOptions) -> Option<Fit> {
+        let Fit { mut pose, mut inliers, mut limit_px } = fit;
         for _ in 0..20 {
             let (polished, sum_sq) = self.polish(&pose, &inliers)?;
             pose = polished;
             let agreeing = inliers.iter().filter(|&&i| i).count();
             let taken = self.normal_equations(&pose, &inliers)?.drift_freedom;
             let freedom = 2.0 * agreeing as f64 - 6.0 - taken;
-            sigma = (sum_sq / freedom.max(1.0)).sqrt().max(options.click_noise_px);
-            let next: Vec<bool> = self
-                .residuals_without_drift(&pose, &inliers)
-                .iter()
-                .map(|r| r.is_some_and(|r| r.norm() <= RAYLEIGH_LIMIT * sigma))
-                .collect();
+            let residuals = self.residuals_without_drift(&pose, &inliers);
+            let mut sigma = (sum_sq / freedom.max(1.0)).sqrt();
+            if taken > 0.0 {
+                // A camera's drift follows its wrong click half way, which hides it in the sum, but not in the median.
+                sigma =
+                    sigma.min(median(&residuals) / RAYLEIGH_MEDIAN * (2.0 * agreeing as f64 / freedom.max(1.0)).sqrt());
+            }
+            limit_px = RAYLEIGH_LIMIT * sigma.max(options.click_noise_px);
+            let next: Vec<bool> = residuals.iter().map(|r| r.is_some_and(|r| r.norm() <= limit_px)).collect();
             if next == inliers || next.iter().filter(|&&i| i).count() < 4 {
                 break;
             }
             inliers = next;
         }
-        Some(Fit { pose, inliers, limit_px: RAYLEIGH_LIMIT * sigma })
+        Some(Fit { pose, inliers, limit_px })
+    }
+
+    /// The clicks that agree, chosen anew camera by camera where the cameras have drifted: the drift moves all of a camera's
+    /// clicks alike, and a wrong click moves the drift. Each click in turn says what the drift is, and those that agree with it,
+    /// at least three and more than half of the camera's, take the place of the former ones where this costs less: in squared
+    /// residuals, in drift, and `limit_px` squared for a click that is left out. `None` where nothing changes.
+    fn with_drifted_cameras(&self, fit: &Fit) -> Option<Vec<bool>> {
+        if self.normal_equations(&fit.pose, &fit.inliers)?.drift_freedom <= 0.0 {
+            return None;
+        }
+        let cost = |inliers: &[bool]| {
+            let left_out = inliers.iter().filter(|&&i| !i).count();
+            self.normal_equations(&fit.pose, inliers).map(|e| e.sum_sq + left_out as f64 * fit.limit_px.powi(2))
+        };
+        let mut inliers = fit.inliers.clone();
+        for camera in 0..self.cameras.len() {
+            let clicks: Vec<usize> =
+                (0..inliers.len()).filter(|&i| self.correspondences[i].camera_idx == camera).collect();
+            let mut best = cost(&inliers)?;
+            let former = inliers.clone();
+            for &i in &clicks {
+                let mut chosen = former.clone();
+                clicks.iter().for_each(|&j| chosen[j] = i == j);
+                let residuals = self.residuals_without_drift(&fit.pose, &chosen);
+                clicks.iter().for_each(|&j| chosen[j] = residuals[j].is_some_and(|r| r.norm() <= fit.limit_px));
+                let agreeing = clicks.iter().filter(|&&j| chosen[j]).count();
+                if agreeing < 3 || 2 * agreeing <= clicks.len() {
+                    continue;
+                }
+                if let Some(cost) = cost(&chosen).filter(|cost| *cost < best) {
+                    (best, inliers) = (cost, chosen);
+                }
+            }
+        }
+        (inliers != fit.inliers).then_some(inliers)
     }
 
     /// Which correspondences have a residual of at most `limit_px`.

@@ -211,3 +211,27 @@ fn the_same_seed_gives_the_same_bytes() {
     w.correspondences[4].pixel.x += 90.0;
     assert_eq!(estimate(&w), estimate(&w));
 }
+
+/// A phone's drift moves all clicks of a camera by tens of pixels; one wrong click must not take the others with it.
+#[test]
+fn a_wrong_click_in_a_drifted_camera_is_found_and_no_other() {
+    let options = PnpOptions { drift_deg: 0.6, drift_mm: 4.5, ..PnpOptions::default() };
+    for seed in 0..40 {
+        let mut w = clicked(seed, &orbit(4), &solid(seed, 20), 1.0);
+        // The phone believes its cameras elsewhere than they were.
+        let mut rng = rng(seed, 11);
+        for camera in &mut w.cameras {
+            let shift = Vector3::from_fn(|_, _| rng.random_range(-6.0..6.0f64) * 1e-3);
+            camera.world_from_cam = Rigid3::from_parts(
+                UnitQuaternion::new(Vector3::from_fn(|_, _| rng.random_range(-0.8..0.8f64).to_radians()))
+                    * camera.world_from_cam.rotation(),
+                camera.world_from_cam.translation() + shift,
+            );
+        }
+        let wrong = 4 * (seed as usize % 5) + seed as usize % 4;
+        w.correspondences[wrong].pixel.x += 90.0;
+        let found = estimate_pose(&w.cameras, &w.correspondences, &options).unwrap();
+        let left_out: Vec<usize> = (0..20).filter(|i| !found.inliers[*i]).collect();
+        assert_eq!(left_out, [wrong], "seed {seed}");
+    }
+}
