@@ -29,6 +29,8 @@ pub struct Work<'a> {
 
 /// Threads of a workgroup in every kernel.
 pub const WORKGROUP: usize = 64;
+/// Storage buffers of the kernel that has most.
+const STORAGE_BUFFERS: u32 = 15;
 /// Workgroups in a row; a device allows 65535.
 const ROW: usize = 32_768;
 
@@ -75,6 +77,12 @@ impl Context {
 
     fn open(adapter: &wgpu::Adapter) -> Result<Self> {
         let name = adapter.get_info().name;
+        let buffers = adapter.limits().max_storage_buffers_per_shader_stage;
+        if buffers < STORAGE_BUFFERS {
+            return Err(Error::Failed(format!(
+                "{name} is too small: its kernels can have {buffers} buffers, and {STORAGE_BUFFERS} are needed. Use --device cpu"
+            )));
+        }
         let (device, queue) = pollster::block_on(
             adapter.request_device(&wgpu::DeviceDescriptor { required_limits: adapter.limits(), ..Default::default() }),
         )

@@ -19,7 +19,6 @@ use std::str::FromStr;
 
 use mb_job::{Error, Result};
 use mb_neural::device::{Device, Processor};
-use mb_neural::sdf_field::{DirectionEncoding, PositionEncoding};
 use mb_neural::{FieldOptions, Method};
 
 #[cfg(feature = "wgpu")]
@@ -34,6 +33,8 @@ mod nerf;
 pub mod network;
 #[cfg(feature = "wgpu")]
 mod neus;
+#[cfg(feature = "wgpu")]
+mod on_device;
 #[cfg(feature = "wgpu")]
 mod radiance;
 #[cfg(feature = "wgpu")]
@@ -91,14 +92,7 @@ fn unsupported(options: &FieldOptions) -> Option<&'static str> {
             Some("a GPU cannot correct cameras in training yet")
         }
         Method::Nerf(_) => None,
-        Method::Neus(o)
-            if matches!(o.field.position, PositionEncoding::Hash(_))
-                && o.field.direction == DirectionEncoding::Harmonics
-                && o.field.skip.is_none()
-                && !o.field.weight_norm =>
-        {
-            None
-        }
+        Method::Neus(neus) if neus.field.is_plain() => None,
         _ => Some("a GPU trains only nerf and neus with the preset fast yet"),
     }
 }
@@ -141,15 +135,15 @@ impl Device for Gpu {
         options: &FieldOptions,
         data: &mb_neural::dataset::RayDataset,
     ) -> Result<Box<dyn mb_neural::model::Model>> {
+        use on_device::OnDevice;
         match (&options.method, unsupported(options)) {
             (Method::Nerf(nerf), None) => {
                 let twin = mb_neural::nerf::Nerf::new(nerf.clone(), data);
-                Ok(Box::new(nerf::GpuNerf::new(twin, self.0.clone())))
+                Ok(Box::new(OnDevice(nerf::GpuNerf::new(twin, self.0.clone()))))
             }
             (Method::Neus(neus), None) => {
                 let twin = mb_neural::neus::Neus::new(neus.clone(), data);
-                let model = neus::GpuNeus::new(twin, self.0.clone());
-                Ok(Box::new(model.ok_or_else(|| Error::Failed("the GPU lacks a part of this field".to_owned()))?))
+                Ok(Box::new(OnDevice(neus::GpuNeus::new(twin, self.0.clone()))))
             }
             (_, why) => Err(Error::Failed(format!("{}. Use --device cpu", why.unwrap_or("the GPU lacks the method")))),
         }

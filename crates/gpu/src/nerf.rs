@@ -5,17 +5,18 @@ use std::sync::Arc;
 
 use mb_job::{Result, rng};
 use mb_neural::cameras::CameraResiduals;
-use mb_neural::dataset::{RayDataset, SceneRay};
-use mb_neural::model::{GROUPS, Level, Model, StepReport};
+use mb_neural::dataset::RayDataset;
+use mb_neural::model::{GROUPS, StepReport};
 use mb_neural::nerf::{DARK, Nerf};
-use mb_neural::occupancy::{CELL_MEMORY, OccupancyGrid, looks_everywhere};
+use mb_neural::occupancy::{CELL_MEMORY, looks_everywhere};
 use rand::RngExt as _;
 
 use crate::context::{Buffer, Context};
 use crate::encoding::unit_of;
 use crate::kernels::Kernels;
+use crate::on_device::Learner;
 use crate::radiance::Radiance;
-use crate::rays::{RAY, Samples, Space, pack};
+use crate::rays::{RAY, Samples, Space, occupied, pack};
 
 /// A NeRF whose twin holds all that is not of the device, and, after a fetch, all that the device has learned.
 pub struct GpuNerf {
@@ -27,11 +28,6 @@ pub struct GpuNerf {
     samples: Samples,
     weights: Buffer,
     losses: Buffer,
-}
-
-/// The cells that may hold something, as `march.wgsl` reads them.
-pub fn occupied(context: &Context, cells: &OccupancyGrid) -> Buffer {
-    context.upload(&cells.occupied().iter().map(|o| u32::from(*o)).collect::<Vec<_>>())
 }
 
 impl GpuNerf {
@@ -118,17 +114,15 @@ impl GpuNerf {
     }
 }
 
-impl Model for GpuNerf {
-    fn name(&self) -> &'static str {
-        self.twin.name()
+impl Learner for GpuNerf {
+    type Twin = Nerf;
+
+    fn twin(&self) -> &Nerf {
+        &self.twin
     }
 
-    fn only_object(&self) -> bool {
-        self.twin.only_object()
-    }
-
-    fn iterations(&self) -> u64 {
-        self.twin.iterations()
+    fn twin_mut(&mut self) -> &mut Nerf {
+        &mut self.twin
     }
 
     fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
@@ -156,47 +150,9 @@ impl Model for GpuNerf {
         self.field.fetch(&self.context, &mut self.twin.parameters)
     }
 
-    fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
-        self.twin.render(rays)
-    }
-
-    fn level(&self) -> Level {
-        self.twin.level()
-    }
-
-    fn surface(&self, positions: &[[f32; 3]]) -> Vec<f32> {
-        self.twin.surface(positions)
-    }
-
-    fn may_cross(&self, low: [f32; 3], high: [f32; 3]) -> bool {
-        self.twin.may_cross(low, high)
-    }
-
-    fn color_at(&self, positions: &[[f32; 3]], directions: &[[f32; 3]]) -> Vec<[f32; 3]> {
-        self.twin.color_at(positions, directions)
-    }
-
-    fn buffers(&mut self) -> Vec<&mut Vec<f32>> {
-        self.twin.buffers()
-    }
-
-    fn restored(&mut self, step: u64) -> std::result::Result<(), String> {
-        self.twin.restored(step)?;
+    fn send(&mut self) {
         let (context, twin) = (&*self.context, &self.twin);
         self.field = Radiance::new(context, &twin.field, &twin.parameters, twin.options.occupancy);
         self.occupied = occupied(context, &twin.occupancy);
-        Ok(())
-    }
-
-    fn is_finite(&self) -> bool {
-        self.twin.is_finite()
-    }
-
-    fn parameter_count(&self) -> usize {
-        self.twin.parameter_count()
-    }
-
-    fn bytes(&self) -> usize {
-        self.twin.bytes()
     }
 }

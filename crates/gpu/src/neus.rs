@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use mb_job::{Result, rng};
 use mb_neural::cameras::CameraResiduals;
-use mb_neural::dataset::{RayDataset, SceneRay};
-use mb_neural::model::{GROUPS, Level, Model, StepReport};
+use mb_neural::dataset::RayDataset;
+use mb_neural::model::{GROUPS, StepReport};
 use mb_neural::neus::{DARK, FREE_POINTS, Neus, SHORTEST_OUTER_STEP, nearness};
 use mb_neural::occupancy::{CELL_MEMORY, looks_everywhere};
 use mb_neural::radiance_field::ADAM;
@@ -16,10 +16,10 @@ use rand::RngExt as _;
 use crate::context::{Buffer, Context, Work};
 use crate::encoding::{Encoding, Points, unit_of};
 use crate::kernels::Kernels;
-use crate::nerf::occupied;
 use crate::network::Network;
+use crate::on_device::Learner;
 use crate::radiance::Radiance;
-use crate::rays::{RAY, Samples, Space, pack, starts};
+use crate::rays::{RAY, Samples, Space, occupied, pack, starts};
 use crate::trained::AdamStep;
 
 /// Points that are asked for their distance at once.
@@ -169,13 +169,20 @@ struct Drawn {
     free: Vec<[f32; 3]>,
 }
 
+fn plain_parts(twin: &Neus) -> SdfParts<'_> {
+    twin.field.parts().expect("only plain fields come here")
+}
+
 impl GpuNeus {
-    /// From its twin, which may have been trained; `None` where its field has parts that no kernel knows.
-    pub fn new(twin: Neus, context: Arc<Context>) -> Option<Self> {
+    /// From its twin, which may have been trained.
+    ///
+    /// # Panics
+    /// Its field is not plain: see [`mb_neural::sdf_field::SdfFieldOptions::is_plain`].
+    pub fn new(twin: Neus, context: Arc<Context>) -> Self {
         let c = &*context;
-        let surface = Surface::new(c, &twin.field.parts()?);
+        let surface = Surface::new(c, &plain_parts(&twin));
         let outside = Radiance::new(c, &twin.outside, &twin.outside_parameters, twin.options.occupancy);
-        Some(Self {
+        Self {
             kernels: Kernels::new(c),
             surface,
             outside,
@@ -187,7 +194,7 @@ impl GpuNeus {
             losses: c.zeros(0),
             twin,
             context,
-        })
+        }
     }
 
     /// Rays and free points of a step, as the twin draws them.
@@ -342,17 +349,15 @@ impl GpuNeus {
     }
 }
 
-impl Model for GpuNeus {
-    fn name(&self) -> &'static str {
-        self.twin.name()
+impl Learner for GpuNeus {
+    type Twin = Neus;
+
+    fn twin(&self) -> &Neus {
+        &self.twin
     }
 
-    fn only_object(&self) -> bool {
-        self.twin.only_object()
-    }
-
-    fn iterations(&self) -> u64 {
-        self.twin.iterations()
+    fn twin_mut(&mut self) -> &mut Neus {
+        &mut self.twin
     }
 
     fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
@@ -384,50 +389,11 @@ impl Model for GpuNeus {
         self.outside.fetch(&self.context, &mut self.twin.outside_parameters)
     }
 
-    fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
-        self.twin.render(rays)
-    }
-
-    fn level(&self) -> Level {
-        self.twin.level()
-    }
-
-    fn surface(&self, positions: &[[f32; 3]]) -> Vec<f32> {
-        self.twin.surface(positions)
-    }
-
-    fn may_cross(&self, low: [f32; 3], high: [f32; 3]) -> bool {
-        self.twin.may_cross(low, high)
-    }
-
-    fn color_at(&self, positions: &[[f32; 3]], directions: &[[f32; 3]]) -> Vec<[f32; 3]> {
-        self.twin.color_at(positions, directions)
-    }
-
-    fn buffers(&mut self) -> Vec<&mut Vec<f32>> {
-        self.twin.buffers()
-    }
-
-    fn restored(&mut self, step: u64) -> std::result::Result<(), String> {
-        self.twin.restored(step)?;
+    fn send(&mut self) {
         let (context, twin) = (&*self.context, &self.twin);
-        let parts = twin.field.parts().ok_or("the field has parts that no kernel knows")?;
-        self.surface = Surface::new(context, &parts);
+        self.surface = Surface::new(context, &plain_parts(twin));
         self.outside = Radiance::new(context, &twin.outside, &twin.outside_parameters, twin.options.occupancy);
         self.inner_cells = occupied(context, &twin.inner_cells);
         self.outer_cells = occupied(context, &twin.outer_cells);
-        Ok(())
-    }
-
-    fn is_finite(&self) -> bool {
-        self.twin.is_finite()
-    }
-
-    fn parameter_count(&self) -> usize {
-        self.twin.parameter_count()
-    }
-
-    fn bytes(&self) -> usize {
-        self.twin.bytes()
     }
 }

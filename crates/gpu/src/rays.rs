@@ -2,6 +2,7 @@
 
 use mb_job::Result;
 use mb_neural::dataset::TargetRay;
+use mb_neural::occupancy::OccupancyGrid;
 
 use crate::context::{Buffer, Context};
 use crate::encoding::Points;
@@ -32,6 +33,11 @@ pub fn starts(counts: &[u32]) -> Vec<u32> {
         sum
     }));
     out
+}
+
+/// The cells that may hold something, as `march.wgsl` reads them.
+pub fn occupied(context: &Context, cells: &OccupancyGrid) -> Buffer {
+    context.upload(&cells.occupied().iter().map(|o| u32::from(*o)).collect::<Vec<_>>())
 }
 
 /// Where rays are sampled; see `march.wgsl`.

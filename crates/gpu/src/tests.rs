@@ -25,11 +25,12 @@ use rand::RngExt as _;
 use crate::context::Context;
 use crate::encoding::{Encoding, Points, unit_of};
 use crate::kernels::Kernels;
-use crate::nerf::{GpuNerf, occupied};
+use crate::nerf::GpuNerf;
 use crate::network::Network;
 use crate::neus::GpuNeus;
+use crate::on_device::OnDevice;
 use crate::radiance::Radiance;
-use crate::rays::{RAY, Samples, Space, pack, starts};
+use crate::rays::{RAY, Samples, Space, occupied, pack, starts};
 use crate::trained::{AdamStep, Trained};
 
 /// The device, one test at a time: software devices use every core.
@@ -471,7 +472,7 @@ fn training_follows_the_twin_and_repeats_its_bytes() {
     let expected = losses(&mut twin, &data);
     let mut runs = Vec::new();
     for _ in 0..2 {
-        let mut gpu = GpuNerf::new(Nerf::new(small(), &data), Arc::clone(&context));
+        let mut gpu = OnDevice(GpuNerf::new(Nerf::new(small(), &data), Arc::clone(&context)));
         let found = losses(&mut gpu, &data);
         gpu.fetch().expect("parameters");
         assert!(gpu.is_finite());
@@ -503,7 +504,7 @@ fn a_checkpoint_moves_between_devices_and_a_lost_device_keeps_it() {
     let json = serde_json::Value::Null;
     let lost = Arc::clone(&context);
     let stop = LoseAt { step: 6, context: lost };
-    let mut gpu = GpuNerf::new(Nerf::new(small(), &data), context);
+    let mut gpu = OnDevice(GpuNerf::new(Nerf::new(small(), &data), context));
     let error = train(&mut gpu, &data, &mut cameras, &json, &run, &stop).expect_err("the device is lost").to_string();
     assert!(error.contains("lost") && error.contains("holds the last good state"), "{error}");
     let mut twin = Nerf::new(small(), &data);
@@ -615,7 +616,7 @@ fn a_step_of_neus_has_the_gradients_of_its_twin() {
             twin
         };
         let mut twin = start();
-        let mut gpu = GpuNeus::new(start(), Arc::clone(&context)).expect("a field of known parts");
+        let mut gpu = OnDevice(GpuNeus::new(start(), Arc::clone(&context)));
         let expected = twin.step(&data, &mut cameras, 0).expect("a step");
         let found = gpu.step(&data, &mut cameras, 0).expect("a step");
         gpu.fetch().expect("parameters");
@@ -639,7 +640,7 @@ fn training_of_neus_follows_the_twin_and_repeats_its_bytes() {
         let expected = losses(&mut Neus::new(small_neus(), &data), &data);
         let run = || {
             let twin = Neus::new(small_neus(), &data);
-            let mut gpu = GpuNeus::new(twin, Arc::clone(&context)).expect("a field of known parts");
+            let mut gpu = OnDevice(GpuNeus::new(twin, Arc::clone(&context)));
             let found = losses(&mut gpu, &data);
             gpu.fetch().expect("parameters");
             let buffers: Vec<Vec<f32>> = gpu.buffers().into_iter().map(|b| b.clone()).collect();

@@ -15,6 +15,9 @@ fn every_shader_is_valid_and_every_entry_point_has_the_same_workgroup() {
         Validator::new(ValidationFlags::all(), Capabilities::empty())
             .validate(&module)
             .unwrap_or_else(|e| panic!("{shown}: {}", e.emit_to_string_with_path(&source, &shown.to_string())));
+        // `Context` asks a device for so many.
+        let storage = |space| matches!(space, naga::AddressSpace::Storage { .. });
+        assert!(module.global_variables.iter().filter(|(_, v)| storage(v.space)).count() <= 15, "{shown}");
         for entry in &module.entry_points {
             assert_eq!(entry.workgroup_size, [64, 1, 1], "{shown}: {}", entry.name);
             entry_points += 1;

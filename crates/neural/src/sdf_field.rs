@@ -68,6 +68,14 @@ pub struct SdfFieldOptions {
 }
 
 impl SdfFieldOptions {
+    /// Whether the field is a hash grid, harmonics and two plain networks: without skip layer and weight normalisation.
+    pub fn is_plain(&self) -> bool {
+        matches!(self.position, PositionEncoding::Hash(_))
+            && self.direction == DirectionEncoding::Harmonics
+            && self.skip.is_none()
+            && !self.weight_norm
+    }
+
     /// The networks of the paper (Wang et al. 2021 and its code, `confs/wmask.conf`): distance 8 x 256 with softplus of
     /// sharpness 100, skip at layer 4, 6 octaves, 256 features; colour 4 x 256 with 4 octaves of the direction; both
     /// with normalised weights; a ball of radius 0.5 at the start.
@@ -197,14 +205,11 @@ impl SdfField {
         }
     }
 
-    /// The hash grid, the geometry network and the colour network, each with its parameters; `None` where the field has
-    /// frequencies, weight normalisation or a skip layer.
+    /// The hash grid, the geometry network and the colour network, each with its parameters; `None` where the
+    /// field [is not plain](SdfFieldOptions::is_plain).
     pub fn parts(&self) -> Option<SdfParts<'_>> {
-        let grid = self.grid.as_ref()?;
-        let plain = self.options.direction == DirectionEncoding::Harmonics
-            && !self.options.weight_norm
-            && self.options.skip.is_none();
-        plain.then(|| SdfParts {
+        let grid = self.grid.as_ref().filter(|_| self.options.is_plain())?;
+        Some(SdfParts {
             grid,
             table: &self.table,
             geometry: (self.geometry.mlp(), self.geometry.direct()),

@@ -1,9 +1,12 @@
 // The multi-resolution hash encoding, its gradient and its scatter. Twin: `HashGrid`, whose module has the formulas.
 // One thread for each sample and level, but for `normals`: one for each sample.
 
+const MOST_FEATURES = 8u;
+
 struct Sizes {
     samples: u32,
     levels: u32,
+    // Of a level, at most MOST_FEATURES.
     features: u32,
     // Row length of the features, and the encoding's first column. Where that is 3, the position in -1..1 comes first.
     stride: u32,
@@ -50,6 +53,23 @@ fn entry(level: vec4<u32>, cell: Cell, corner: u32) -> u32 {
     return level.y + select(hashed, dense, level.w == 1u) * sizes.features;
 }
 
+// What a thread works on: a sample's cell in a level, and where the level's features begin in the sample's row.
+struct Place {
+    sample: u32,
+    l: u32,
+    level: vec4<u32>,
+    cell: Cell,
+    row: u32,
+}
+
+fn place_of(thread: u32) -> Place {
+    let l = thread % sizes.levels;
+    let sample = thread / sizes.levels;
+    let level = levels[l];
+    let row = sample * sizes.stride + sizes.first + l * sizes.features;
+    return Place(sample, l, level, cell_of(sample, level.x), row);
+}
+
 fn weight(cell: Cell, corner: u32) -> f32 {
     let upper = vec3((corner & 1u) == 1u, ((corner >> 1u) & 1u) == 1u, (corner >> 2u) == 1u);
     let w = select(1.0 - cell.t, cell.t, upper);
@@ -62,21 +82,21 @@ fn forward(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups
     if thread >= sizes.samples * sizes.levels {
         return;
     }
-    let l = thread % sizes.levels;
-    let sample = thread / sizes.levels;
-    let level = levels[l];
-    let cell = cell_of(sample, level.x);
-    let to = sample * sizes.stride + sizes.first + l * sizes.features;
-    for (var f = 0u; f < sizes.features; f += 1u) {
-        var sum = 0.0;
-        for (var c = 0u; c < 8u && l < sizes.active_levels; c += 1u) {
-            sum += weight(cell, c) * table[entry(level, cell, c) + f];
+    let at = place_of(thread);
+    var sums = array<f32, MOST_FEATURES>();
+    for (var c = 0u; c < 8u && at.l < sizes.active_levels; c += 1u) {
+        let w = weight(at.cell, c);
+        let from_entry = entry(at.level, at.cell, c);
+        for (var f = 0u; f < sizes.features; f += 1u) {
+            sums[f] += w * table[from_entry + f];
         }
-        features[to + f] = sum;
     }
-    if l == 0u && sizes.first == 3u {
+    for (var f = 0u; f < sizes.features; f += 1u) {
+        features[at.row + f] = sums[f];
+    }
+    if at.l == 0u && sizes.first == 3u {
         for (var d = 0u; d < 3u; d += 1u) {
-            features[sample * sizes.stride + d] = 2.0 * positions[3u * sample + d] - 1.0;
+            features[at.sample * sizes.stride + d] = 2.0 * positions[3u * at.sample + d] - 1.0;
         }
     }
 }
@@ -100,22 +120,20 @@ fn normals_of(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgro
     if sample >= sizes.samples {
         return;
     }
-    let row = sample * sizes.stride;
     var n = vec3(0.0);
     for (var l = 0u; l < sizes.active_levels; l += 1u) {
-        let level = levels[l];
-        let cell = cell_of(sample, level.x);
+        let at = place_of(sample * sizes.levels + l);
         for (var c = 0u; c < 8u; c += 1u) {
-            let from_entry = entry(level, cell, c);
+            let from_entry = entry(at.level, at.cell, c);
             var dot_g = 0.0;
             for (var f = 0u; f < sizes.features; f += 1u) {
-                dot_g += features[row + sizes.first + l * sizes.features + f] * table[from_entry + f];
+                dot_g += features[at.row + f] * table[from_entry + f];
             }
-            n += 0.5 * f32(level.x) * dot_g * weight_gradient(cell, c);
+            n += 0.5 * f32(at.level.x) * dot_g * weight_gradient(at.cell, c);
         }
     }
     for (var d = 0u; d < 3u; d += 1u) {
-        normals[3u * sample + d] = features[row + d] + n[d];
+        normals[3u * sample + d] = features[sample * sizes.stride + d] + n[d];
     }
 }
 
@@ -126,22 +144,22 @@ fn tangent(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups
     if thread >= sizes.samples * sizes.levels {
         return;
     }
-    let l = thread % sizes.levels;
-    let sample = thread / sizes.levels;
-    let level = levels[l];
-    let cell = cell_of(sample, level.x);
-    let d_n = normal_of(sample);
-    let to = sample * sizes.stride + sizes.first + l * sizes.features;
-    for (var f = 0u; f < sizes.features; f += 1u) {
-        var sum = 0.0;
-        for (var c = 0u; c < 8u && l < sizes.active_levels; c += 1u) {
-            sum += dot(weight_gradient(cell, c), d_n) * table[entry(level, cell, c) + f];
+    let at = place_of(thread);
+    let d_n = normal_of(at.sample);
+    var sums = array<f32, MOST_FEATURES>();
+    for (var c = 0u; c < 8u && at.l < sizes.active_levels; c += 1u) {
+        let w = 0.5 * f32(at.level.x) * dot(weight_gradient(at.cell, c), d_n);
+        let from_entry = entry(at.level, at.cell, c);
+        for (var f = 0u; f < sizes.features; f += 1u) {
+            sums[f] += w * table[from_entry + f];
         }
-        features[to + f] = 0.5 * f32(level.x) * sum;
     }
-    if l == 0u {
+    for (var f = 0u; f < sizes.features; f += 1u) {
+        features[at.row + f] = sums[f];
+    }
+    if at.l == 0u {
         for (var d = 0u; d < 3u; d += 1u) {
-            features[sample * sizes.stride + d] = d_n[d];
+            features[at.sample * sizes.stride + d] = d_n[d];
         }
     }
 }
@@ -169,19 +187,15 @@ fn add(parameter: u32, share: f32) {
 @compute @workgroup_size(64)
 fn scatter(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     let thread = id.y * groups.x * 64u + id.x;
-    let l = thread % sizes.levels;
-    let sample = thread / sizes.levels;
-    if sample >= sizes.samples || l >= sizes.active_levels {
+    if thread >= sizes.samples * sizes.levels || thread % sizes.levels >= sizes.active_levels {
         return;
     }
-    let level = levels[l];
-    let cell = cell_of(sample, level.x);
-    let from_row = sample * sizes.stride + sizes.first + l * sizes.features;
+    let at = place_of(thread);
     for (var c = 0u; c < 8u; c += 1u) {
-        let w = weight(cell, c);
-        let to = entry(level, cell, c);
+        let w = weight(at.cell, c);
+        let to = entry(at.level, at.cell, c);
         for (var f = 0u; f < sizes.features; f += 1u) {
-            add(to + f, w * features[from_row + f]);
+            add(to + f, w * features[at.row + f]);
         }
     }
 }
@@ -190,21 +204,17 @@ fn scatter(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups
 @compute @workgroup_size(64)
 fn scatter_both(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     let thread = id.y * groups.x * 64u + id.x;
-    let l = thread % sizes.levels;
-    let sample = thread / sizes.levels;
-    if sample >= sizes.samples || l >= sizes.active_levels {
+    if thread >= sizes.samples * sizes.levels || thread % sizes.levels >= sizes.active_levels {
         return;
     }
-    let level = levels[l];
-    let cell = cell_of(sample, level.x);
-    let d_n = normal_of(sample);
-    let from_row = sample * sizes.stride + sizes.first + l * sizes.features;
+    let at = place_of(thread);
+    let d_n = normal_of(at.sample);
     for (var c = 0u; c < 8u; c += 1u) {
-        let w = weight(cell, c);
-        let w_n = 0.5 * f32(level.x) * dot(weight_gradient(cell, c), d_n);
-        let to = entry(level, cell, c);
+        let w = weight(at.cell, c);
+        let w_n = 0.5 * f32(at.level.x) * dot(weight_gradient(at.cell, c), d_n);
+        let to = entry(at.level, at.cell, c);
         for (var f = 0u; f < sizes.features; f += 1u) {
-            add(to + f, w * features[from_row + f] + w_n * gradient[from_row + f]);
+            add(to + f, w * features[at.row + f] + w_n * gradient[at.row + f]);
         }
     }
 }
