@@ -1,4 +1,7 @@
 //! Building the tree: binned surface area heuristic (Wald 2007), subtrees in parallel.
+//!
+//! Many triangles are first put into the cells of a coarse grid. The upper half of the tree is then built over cells in
+//! place of triangles, which spares half of the passes over all of them (after Garanzha, Pantaleoni, McAllister 2011).
 
 use nalgebra::Point3;
 use rayon::prelude::*;
@@ -11,6 +14,8 @@ const BINS: usize = 16;
 const FEW_BINS: usize = 8;
 /// As many triangles as this are few.
 const FEW: usize = 48;
+/// So many are split in the middle, which bins would hardly do better.
+const VERY_FEW: usize = 16;
 /// Up to so many triangles are always a leaf: testing them costs no more than visiting the nodes above single ones, and
 /// half of the work of building a tree lies in its last two levels.
 const MIN_LEAF: usize = 4;
@@ -20,6 +25,12 @@ const MAX_LEAF: usize = 8;
 const NODE_COST: f32 = 1.0;
 /// Subtrees below this size are built by one thread.
 const PARALLEL_FROM: usize = 32_768;
+/// As many triangles as this are put into cells first.
+pub(super) const CELLS_FROM: usize = 65_536;
+/// Cells of the grid on each axis.
+const CELLS: usize = 32;
+/// Where the subtrees of cells begin. No tree over 32^3 cells is deeper: from [`CELLS_DEPTH`] - 15 on, it halves their number.
+const CELLS_DEPTH: usize = 40;
 /// From this depth on, halves are split by count, so that even a hostile mesh keeps within [`MAX_DEPTH`]:
 /// 2^32 triangles need 32 more levels.
 const COUNT_SPLIT_FROM: usize = MAX_DEPTH - 34;
@@ -59,30 +70,47 @@ impl Box3 {
     }
 }
 
-/// A triangle while the tree is built: its box, whose spare lane holds its number.
+/// A triangle, or a cell of many, while the tree is built: its box, whose spare lanes hold the number of triangles and its
+/// own number.
 #[derive(Clone, Copy)]
 struct Primitive(Box3);
 
 impl Primitive {
-    fn new(corners: &[Point3<f64>; 3], triangle: u32) -> Self {
+    fn cell(mut bounds: Box3, number: u32, triangles: u32) -> Self {
+        bounds.min[3] = f32::from_bits(triangles);
+        bounds.max[3] = f32::from_bits(number);
+        Self(bounds)
+    }
+
+    /// Of no triangle, where a corner is not finite.
+    fn of_triangle(corners: &[Point3<f64>; 3], triangle: u32) -> Self {
         let [a, b, c] = corners;
         let mut bounds = Box3 { min: [0.0; 4], max: [0.0; 4] };
         for axis in 0..3 {
             bounds.min[axis] = round_down(a[axis].min(b[axis]).min(c[axis]));
             bounds.max[axis] = round_up(a[axis].max(b[axis]).max(c[axis]));
         }
-        bounds.max[3] = f32::from_bits(triangle);
-        Self(bounds)
+        let is_finite = corners.iter().all(|p| p.coords.iter().all(|v| v.is_finite()));
+        Self::cell(bounds, triangle, u32::from(is_finite))
     }
 
-    fn triangle(&self) -> u32 {
+    fn number(&self) -> u32 {
         self.0.max[3].to_bits()
+    }
+
+    fn triangles(&self) -> u32 {
+        self.0.min[3].to_bits()
     }
 
     /// Twice the middle of the box, which sorts like the middle.
     #[inline]
     fn centre2(&self) -> Lanes {
-        std::array::from_fn(|axis| self.0.min[axis] + self.0.max[axis])
+        std::array::from_fn(|axis| self.centre2_along(axis))
+    }
+
+    #[inline]
+    fn centre2_along(&self, axis: usize) -> f32 {
+        self.0.min[axis] + self.0.max[axis]
     }
 }
 
@@ -107,17 +135,96 @@ pub(super) fn build(mesh: &TriangleMesh) -> Bvh {
 pub(super) fn build_without_corners(mesh: &TriangleMesh) -> Bvh {
     let mut primitives: Vec<Primitive> = (0..mesh.triangles.len())
         .into_par_iter()
-        .filter_map(|index| {
-            let corners = mesh.triangle(index);
-            let finite = corners.iter().all(|p| p.coords.iter().all(|v| v.is_finite()));
-            finite.then(|| Primitive::new(&corners, index as u32))
-        })
+        .map(|index| Primitive::of_triangle(&mesh.triangle(index), index as u32))
         .collect();
+    primitives.retain(|p| p.triangles() > 0);
     let extent = Extent::of(&primitives);
-    let (nodes, root) =
-        if primitives.is_empty() { (Vec::new(), Child::default()) } else { subtree(&mut primitives, &extent, 0, 0) };
-    let triangles: Vec<u32> = primitives.par_iter().map(Primitive::triangle).collect();
+    let (nodes, root) = match primitives.len() {
+        0 => (Vec::new(), Child::default()),
+        count if count < CELLS_FROM => subtree(&mut primitives, &extent, 0, 0),
+        _ => tree_over_cells(&mut primitives, &extent),
+    };
+    let triangles: Vec<u32> = primitives.par_iter().map(Primitive::number).collect();
     Bvh { nodes, root, corners: Vec::new(), triangles }
+}
+
+/// Builds the tree over many `primitives`, which reach over `extent` and are reordered in place.
+fn tree_over_cells(primitives: &mut [Primitive], extent: &Extent) -> (Vec<Node>, Child) {
+    let starts = sort_by_cell(primitives, &Bins::new(&extent.centres2));
+    let mut cells = Vec::new();
+    let mut rest = primitives;
+    for range in starts.windows(2).filter(|range| range[0] < range[1]) {
+        let (cell, others) = rest.split_at_mut(range[1] - range[0]);
+        cells.push((range[0] as u32, cell));
+        rest = others;
+    }
+    let (mut cells, mut subtrees): (Vec<Primitive>, Vec<(Vec<Node>, Child)>) = cells
+        .into_par_iter()
+        .enumerate()
+        .map(|(number, (first, cell))| {
+            let extent = Extent::of(cell);
+            let whole = Primitive::cell(extent.bounds, number as u32, cell.len() as u32);
+            (whole, subtree(cell, &extent, first, CELLS_DEPTH))
+        })
+        .unzip();
+
+    // A tree with two children a node has one node less than leaves.
+    let mut at = cells.len() as u32 - 1;
+    for (nodes, root) in &mut subtrees {
+        nodes.iter_mut().for_each(|node| node.children = node.children.map(|child| moved(child, at)));
+        *root = moved(*root, at);
+        at += nodes.len() as u32;
+    }
+    let mut nodes = Vec::with_capacity(at as usize);
+    let extent = Extent::of(&cells);
+    let root = join(&mut cells, &extent, 0, &mut nodes, &|cell| subtrees[cell as usize].1);
+    subtrees.into_iter().for_each(|(subtree, _)| nodes.extend(subtree));
+    (nodes, root)
+}
+
+/// Reorders `primitives` by the cells of a grid and returns where each cell begins, and the end (McIlroy, Bostic, McIlroy
+/// 1993: in place, since tens of millions of them fill a good part of the memory).
+fn sort_by_cell(primitives: &mut [Primitive], bins: &Bins<CELLS>) -> Vec<usize> {
+    let cell = |p: &Primitive| bins.of(p).into_iter().rev().fold(0, |cell, bin| cell * CELLS + bin);
+    let mut starts = vec![0; CELLS.pow(3) + 1];
+    primitives.iter().for_each(|p| starts[cell(p) + 1] += 1);
+    (1..starts.len()).for_each(|i| starts[i] += starts[i - 1]);
+    let mut free = starts.clone();
+    for here in 0..CELLS.pow(3) {
+        while free[here] < starts[here + 1] {
+            let home = cell(&primitives[free[here]]);
+            primitives.swap(free[here], free[home]);
+            free[home] += 1;
+        }
+    }
+    starts
+}
+
+/// Appends the inner nodes over `cells` to `nodes`; `root` knows the root of a cell's own subtree.
+fn join(
+    cells: &mut [Primitive],
+    extent: &Extent,
+    depth: usize,
+    nodes: &mut Vec<Node>,
+    root: &impl Fn(u32) -> Child,
+) -> Child {
+    if let [cell] = cells {
+        return root(cell.number());
+    }
+    let bins = Bins::<BINS>::new(&extent.centres2);
+    let by_count = depth + 15 >= CELLS_DEPTH;
+    let middle = match if by_count { None } else { best_bin(cells, &extent.bounds, &bins) } {
+        Some((_, axis, bin)) => partition(cells, |p| bins.along(axis, p) < bin),
+        None => halve(cells, extent),
+    };
+    let (left, right) = cells.split_at_mut(middle);
+    let extents = [Extent::of(left), Extent::of(right)];
+    let at = nodes.len();
+    nodes.push(Node::new(&extents.map(|e| e.bounds), [Child::default(); 2]));
+    let left = join(left, &extents[0], depth + 1, nodes, root);
+    let right = join(right, &extents[1], depth + 1, nodes, root);
+    nodes[at].children = [left, right];
+    Child { first: at as u32, count: 0 }
 }
 
 /// Builds the subtree over `primitives`, which reach over `extent`, stand at `first` in the final order and are reordered
@@ -201,6 +308,12 @@ impl Extent {
         }
         extent
     }
+
+    /// Along which the centres reach farthest.
+    fn longest_axis(&self) -> usize {
+        let length = |axis: usize| self.centres2.max[axis] - self.centres2.min[axis];
+        (0..3).max_by(|&a, &b| length(a).total_cmp(&length(b))).unwrap_or(0)
+    }
 }
 
 /// Bins of equal width between the least and the largest centre on each axis.
@@ -234,8 +347,7 @@ impl<const BINS: usize> Bins<BINS> {
 
     #[inline]
     fn along(&self, axis: usize, p: &Primitive) -> usize {
-        let centre2 = p.0.min[axis] + p.0.max[axis];
-        Self::number((centre2 - self.low[axis]) * self.scale[axis] + Self::SHIFT)
+        Self::number((p.centre2_along(axis) - self.low[axis]) * self.scale[axis] + Self::SHIFT)
     }
 
     #[inline]
@@ -248,8 +360,21 @@ impl<const BINS: usize> Bins<BINS> {
 fn split(primitives: &mut [Primitive], extent: &Extent, depth: usize) -> Option<usize> {
     match primitives.len() {
         count if count <= MIN_LEAF => None,
+        count if count <= VERY_FEW && depth < COUNT_SPLIT_FROM => split_in_the_middle(primitives, extent),
         count if count <= FEW => split_by_bins::<FEW_BINS>(primitives, extent, depth),
         _ => split_by_bins::<BINS>(primitives, extent, depth),
+    }
+}
+
+/// Splits at the middle of the longest axis.
+fn split_in_the_middle(primitives: &mut [Primitive], extent: &Extent) -> Option<usize> {
+    let axis = extent.longest_axis();
+    let middle = 0.5 * (extent.centres2.min[axis] + extent.centres2.max[axis]);
+    match partition(primitives, |p| p.centre2_along(axis) < middle) {
+        // The centres coincide.
+        0 if primitives.len() <= MAX_LEAF => None,
+        0 => Some(halve(primitives, extent)),
+        second => Some(second),
     }
 }
 
@@ -264,17 +389,20 @@ fn split_by_bins<const BINS: usize>(primitives: &mut [Primitive], extent: &Exten
         Some(_) => None,
         None if count <= MAX_LEAF => None,
         // No plane separates the centres: they coincide, or the tree is already too deep for the heuristic.
-        None => {
-            let length = |axis: usize| extent.centres2.max[axis] - extent.centres2.min[axis];
-            let axis = (0..3).max_by(|&a, &b| length(a).total_cmp(&length(b))).unwrap_or(0);
-            let key = |p: &Primitive| (p.centre2()[axis], p.triangle());
-            primitives.select_nth_unstable_by(count / 2, |a, b| {
-                let (a, b) = (key(a), key(b));
-                a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))
-            });
-            Some(count / 2)
-        }
+        None => Some(halve(primitives, extent)),
     }
+}
+
+/// Reorders `primitives` into two halves of the same number along the longest axis and returns where the second begins.
+fn halve(primitives: &mut [Primitive], extent: &Extent) -> usize {
+    let middle = primitives.len() / 2;
+    let axis = extent.longest_axis();
+    let key = |p: &Primitive| (p.centre2_along(axis), p.number());
+    primitives.select_nth_unstable_by(middle, |a, b| {
+        let (a, b) = (key(a), key(b));
+        a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))
+    });
+    middle
 }
 
 /// The cheapest border between bins over the three axes: cost, axis, and the first bin of the second half.
@@ -285,7 +413,7 @@ fn best_bin<const BINS: usize>(primitives: &[Primitive], all: &Box3, bins: &Bins
         for (axis, filled) in filled.iter_mut().enumerate() {
             let (bounds, count) = &mut filled[at[axis]];
             bounds.add(&p.0);
-            *count += 1;
+            *count += p.triangles();
         }
     }
     let whole = all.half_area().max(f32::MIN_POSITIVE);

@@ -134,6 +134,49 @@ fn nothing_is_near_an_empty_mesh_or_a_query_that_is_no_number() {
     assert_eq!(bvh.closest_within(&Point3::new(0.0, 0.0, 1.0), 0.5), None);
 }
 
+/// A bumpy sphere with an outlier, so that most cells are empty and some are full: the tree over cells knows the same
+/// triangles as one over each tenth of them.
+#[test]
+fn a_tree_over_cells_finds_what_small_trees_find() {
+    let n = 220;
+    let vertex = |i: usize, j: usize| {
+        let (theta, phi) = (std::f64::consts::PI * i as f64 / n as f64, std::f64::consts::TAU * j as f64 / n as f64);
+        let radius = 1.0 + 0.1 * (7.0 * theta).sin() * (5.0 * phi).cos();
+        Point3::new(theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()) * radius
+    };
+    let mut vertices: Vec<Point3<f64>> = (0..=n).flat_map(|i| (0..n).map(move |j| vertex(i, j))).collect();
+    let at = |i: usize, j: usize| (i * n + j % n) as u32;
+    let mut triangles: Vec<[u32; 3]> = (0..n)
+        .flat_map(|i| {
+            (0..n).flat_map(move |j| {
+                [[at(i, j), at(i + 1, j), at(i + 1, j + 1)], [at(i, j), at(i + 1, j + 1), at(i, j + 1)]]
+            })
+        })
+        .collect();
+    vertices.push(Point3::new(9.0, -9.0, 9.0));
+    triangles.push([0, 1, vertices.len() as u32 - 1]);
+    let mesh = TriangleMesh::new(vertices, triangles);
+    assert!(mesh.triangles.len() > super::build::CELLS_FROM);
+
+    let bvh = Bvh::new(&mesh);
+    let tenth = mesh.triangles.len().div_ceil(10);
+    let parts: Vec<Bvh> = mesh
+        .triangles
+        .chunks(tenth)
+        .map(|part| Bvh::new(&TriangleMesh::new(mesh.vertices.clone(), part.to_vec())))
+        .collect();
+    for i in 0..300 {
+        let t = f64::from(i);
+        let q = Point3::new((1.3 * t).sin(), (1.7 * t).cos(), (0.9 * t).sin()) * (0.01 * t);
+        let whole = bvh.closest(&q).unwrap();
+        let least = parts.iter().map(|part| part.closest(&q).unwrap().distance).fold(f64::INFINITY, f64::min);
+        assert_eq!(whole.distance, least);
+        let ray = Ray { origin: q, direction: Vector3::new((0.3 * t).cos(), (0.7 * t).sin(), 0.2) };
+        let first = parts.iter().filter_map(|part| part.cast(&ray, 20.0)).map(|hit| hit.t).min_by(f64::total_cmp);
+        assert_eq!(bvh.cast(&ray, 20.0).map(|hit| hit.t), first);
+    }
+}
+
 #[test]
 fn triangles_that_are_not_finite_are_left_out() {
     let mut mesh = fan(6);
@@ -150,13 +193,14 @@ fn hostile_distributions_do_not_overflow_the_stack() {
         vec![Point3::origin(), Point3::new(1.0, 0.0, 0.0), Point3::new(0.0, 1.0, 0.0)],
         vec![[0, 1, 2]; 5000],
     );
+    let many_equal = TriangleMesh { triangles: vec![[0, 1, 2]; 70_000], ..equal.clone() };
     let mut growing = TriangleMesh::default();
     for i in 0..2000u32 {
         let s = 1.1f64.powi(i as i32 % 700) * 1e-20;
         growing.vertices.extend([Point3::new(s, 0.0, 0.0), Point3::new(s, s, 0.0), Point3::new(s, 0.0, s)]);
         growing.triangles.push([3 * i, 3 * i + 1, 3 * i + 2]);
     }
-    for mesh in [equal, growing] {
+    for mesh in [equal, many_equal, growing] {
         let bvh = Bvh::new(&mesh);
         let corner = mesh.triangle(7)[0];
         assert_eq!(bvh.closest(&corner).unwrap().distance, 0.0);
