@@ -1,6 +1,6 @@
 //! Time of each kernel on a device beside its twin on the processor:
-//! `cargo bench -p mb-gpu --features wgpu --bench kernels -- [gpu|gpu:N] [SAMPLES]`. Sizes are those of `nerf` and `neus` with
-//! `--preset fast`.
+//! `cargo bench -p mb-gpu --features wgpu --bench kernels -- [gpu|gpu:N] [SAMPLES]`. Sizes are those of `nerf`, `neus` and
+//! `dvgo` with `--preset fast`, but for the published trunk.
 //! Device: wall milliseconds, best of five, and CPU milliseconds of this process (which a software device spends, a GPU
 //! does not). Twin: CPU milliseconds. Share: of the arithmetic (GFLOP/s) or traffic (GB/s) that the kernel needs at least.
 
@@ -13,13 +13,17 @@ use mb_gpu::encoding::{Encoding, Points, unit_of};
 use mb_gpu::kernels::Kernels;
 use mb_gpu::network::Network;
 use mb_gpu::trained::AdamStep;
-use mb_neural::adam::AdamOptions;
+use mb_neural::adam::{AdamOptions, Parameters};
+use mb_neural::dense_grid::DenseGrid;
+use mb_neural::dvgo::DvgoOptions;
+use mb_neural::frequency_field::{FrequencyField, FrequencyFieldOptions};
 use mb_neural::hash_grid::Scatter;
 use mb_neural::mlp::{Mlp, MlpCache, Weights};
 use mb_neural::nerf::NerfOptions;
 use mb_neural::neus::NeusOptions;
 use mb_neural::radiance_field::{ADAM, RadianceField};
 use mb_neural::sdf_field::SdfField;
+use mb_neural::voxel_field;
 use rand::RngExt as _;
 
 /// Prints one row.
@@ -30,13 +34,32 @@ struct Rows<'a> {
 
 impl Rows<'_> {
     fn row(&self, name: &str, giga: f64, unit: &str, record: impl Fn(&mut Work<'_>), twin: impl FnOnce()) {
+        self.row_after(|_| (), name, giga, unit, record, twin);
+    }
+
+    /// Runs what is recorded, and waits.
+    fn run(&self, record: impl Fn(&mut Work<'_>)) {
+        let mut work = self.context.work();
+        record(&mut work);
+        work.submit();
+        self.context.read::<u32>(self.probe, 1).expect("the device works");
+    }
+
+    /// The same where something has to happen `before` each run, which is not measured.
+    fn row_after(
+        &self,
+        before: impl Fn(&mut Work<'_>),
+        name: &str,
+        giga: f64,
+        unit: &str,
+        record: impl Fn(&mut Work<'_>),
+        twin: impl FnOnce(),
+    ) {
         let (mut wall, mut cpu) = (f64::INFINITY, f64::INFINITY);
         for _ in 0..5 {
+            self.run(&before);
             let (start, spent) = (Instant::now(), ProcessTime::now());
-            let mut work = self.context.work();
-            record(&mut work);
-            work.submit();
-            self.context.read::<u32>(self.probe, 1).expect("the device works");
+            self.run(&record);
             wall = wall.min(start.elapsed().as_secs_f64());
             cpu = cpu.min(spent.elapsed().as_secs_f64());
         }
@@ -108,42 +131,96 @@ fn main() {
         },
     );
     p.table.grads = grads;
-    rows.row(
+    // It clears the gradient, and leaves alone what has none.
+    rows.row_after(
+        |work| encoding.scatter(work, &k, Points { positions: &positions, count: n }, &d_features, unit_of(1.0)),
         "Adam of the table",
         (grid.len() * 40) as f64 / 1e9,
         "GB",
         |work| encoding.step(work, &k, unit_of(1.0), &AdamStep { options: ADAM, lr: 1e-2, t: 1 }),
         || p.table.step(&AdamOptions { skip_untouched: true, ..ADAM }, 1e-2, 1),
     );
-    let networks: [(&str, &Mlp, _); 2] =
-        [("density network", density, &p.density), ("colour network", color, &p.color)];
-    for (name, mlp, parameters) in networks {
-        let mut network = Network::new(&context, mlp, parameters, false);
-        network.reserve(&context, n);
-        let input: Vec<f32> = (0..n * mlp.in_stride()).map(|_| rng.random_range(-1.0..1.0)).collect();
-        let d_out: Vec<f32> = (0..n * mlp.out_stride()).map(|_| rng.random_range(-1.0..1.0)).collect();
-        let (x, d) = (context.upload(&input), context.upload(&d_out));
-        let gflop = (2 * n * mlp.layout().map(|(inputs, outputs, ..)| inputs * outputs).sum::<usize>()) as f64 / 1e9;
-        let mut cache = MlpCache::default();
-        rows.row(
-            &format!("{name}, forward"),
-            gflop,
-            "GFLOP",
-            |work| network.forward(work, &k, &x, n),
-            || mlp.forward(&parameters.values, &input, mlp.in_stride(), n, &mut cache),
-        );
-        let transposed = mlp.transpose(&parameters.values);
-        let weights = Weights { parameters: &parameters.values, transposed: &transposed };
-        let mut grads = vec![0.0; mlp.buffer_len()];
-        rows.row(
-            &format!("{name}, backward"),
-            2.0 * gflop,
-            "GFLOP",
-            |work| network.backward(work, &k, &x, &d, n),
-            || mlp.backward(&weights, &input, mlp.in_stride(), &mut cache, &d_out, None, &mut grads, true),
-        );
-    }
+    network_rows(&rows, &k, n, "density network", (density, &p.density));
+    network_rows(&rows, &k, n, "colour network", (color, &p.color));
+    // Eight layers of 256: a hundred times the work of a sample.
+    let published = FrequencyField::<3>::new(&FrequencyFieldOptions::PAPER);
+    let trunk = published.init(&mut rng).trunk;
+    network_rows(&rows, &k, n / 16, "trunk of the published nerf, n / 16 samples", (&published.trunk, &trunk));
     surface_rows(&rows, &k, &x);
+    voxel_rows(&rows, &k, &x);
+}
+
+/// The features of the fine stage of `dvgo`.
+fn voxel_rows(rows: &Rows<'_>, k: &Kernels, x: &[[f32; 3]]) {
+    let (context, n) = (rows.context, x.len());
+    let options = DvgoOptions::fast();
+    let channels = options.network.channels;
+    // An eighth of the voxels that a run has at its end: twin and device would need gigabytes.
+    let side = ((options.fine.voxels / 8) as f64).cbrt().round() as usize;
+    let grid = DenseGrid { size: [side; 3], channels };
+    let mut rng = mb_job::rng(2, 0);
+    let mut p = Parameters::new((0..grid.len()).map(|_| rng.random_range(-1.0..1.0)).collect());
+    let encoding = Encoding::of_voxels(context, &grid, &p, channels);
+    let (positions, features) = (context.upload(x.as_flattened()), context.zeros(n * channels));
+    let mut twin_features = vec![0.0; n * channels];
+    let traffic = (n * 8 * channels * 4) as f64 / 1e9;
+    let points = Points { positions: &positions, count: n };
+    rows.row(
+        "voxels",
+        traffic,
+        "GB",
+        |work| encoding.forward(work, k, points, &features),
+        || grid.forward(&p.values, x, &mut twin_features, channels, 0),
+    );
+    let d: Vec<f32> = (0..n * channels).map(|_| rng.random_range(-1.0..1.0)).collect();
+    let d_features = context.upload(&d);
+    let mut grads = vec![0.0; grid.len()];
+    rows.row(
+        "their scatter",
+        2.0 * traffic,
+        "GB",
+        |work| encoding.scatter(work, k, points, &d_features, unit_of(1.0)),
+        || grid.scatter(&[(x, &d)], channels, 0, &mut grads),
+    );
+    p.grads = grads;
+    let options = voxel_field::ADAM;
+    rows.row_after(
+        |work| encoding.scatter(work, k, points, &d_features, unit_of(1.0)),
+        "Adam of the voxels",
+        (grid.len() * 40) as f64 / 1e9,
+        "GB",
+        |work| encoding.step(work, k, unit_of(1.0), &AdamStep { options, lr: 1e-1, t: 1 }),
+        || p.step(&AdamOptions { skip_untouched: true, ..options }, 1e-1, 1),
+    );
+}
+
+/// A network and its derivatives.
+fn network_rows(rows: &Rows<'_>, k: &Kernels, n: usize, name: &str, (mlp, parameters): (&Mlp, &Parameters)) {
+    let (context, mut rng) = (rows.context, mb_job::rng(3, 0));
+    let mut network = Network::new(context, mlp, parameters, false);
+    network.reserve(context, n);
+    let input: Vec<f32> = (0..n * mlp.in_stride()).map(|_| rng.random_range(-1.0..1.0)).collect();
+    let d_out: Vec<f32> = (0..n * mlp.out_stride()).map(|_| rng.random_range(-1.0..1.0)).collect();
+    let (x, d) = (context.upload(&input), context.upload(&d_out));
+    let gflop = (2 * n * mlp.layout().map(|(inputs, outputs, ..)| inputs * outputs).sum::<usize>()) as f64 / 1e9;
+    let mut cache = MlpCache::default();
+    rows.row(
+        &format!("{name}, forward"),
+        gflop,
+        "GFLOP",
+        |work| network.forward(work, k, &x, n),
+        || mlp.forward(&parameters.values, &input, mlp.in_stride(), n, &mut cache),
+    );
+    let transposed = mlp.transpose(&parameters.values);
+    let weights = Weights { parameters: &parameters.values, transposed: &transposed };
+    let mut grads = vec![0.0; mlp.buffer_len()];
+    rows.row(
+        &format!("{name}, backward"),
+        2.0 * gflop,
+        "GFLOP",
+        |work| network.backward(work, k, &x, &d, n),
+        || mlp.backward(&weights, &input, mlp.in_stride(), &mut cache, &d_out, None, &mut grads, true),
+    );
 }
 
 /// The geometry network of a distance field, whose normals a loss uses.
@@ -151,9 +228,10 @@ fn surface_rows(rows: &Rows<'_>, k: &Kernels, x: &[[f32; 3]]) {
     let (context, n) = (rows.context, x.len());
     let mut rng = mb_job::rng(1, 0);
     let field = SdfField::new(NeusOptions::default().field, &mut rng);
-    let parts = field.parts().expect("a field on a hash grid");
-    let (mlp, parameters) = parts.geometry;
-    let encoding = Encoding::new(context, parts.grid, parts.table, 3);
+    let parts = field.parts();
+    let (grid, table) = parts.grid.expect("a hash encoding");
+    let (mlp, parameters) = (parts.geometry.mlp(), parts.geometry.direct());
+    let encoding = Encoding::new(context, grid, table, 3);
     let mut network = Network::new(context, mlp, parameters, true);
     network.reserve(context, n);
     let stride = encoding.stride();
@@ -165,7 +243,7 @@ fn surface_rows(rows: &Rows<'_>, k: &Kernels, x: &[[f32; 3]]) {
     let (mut cache, transposed) = (MlpCache::default(), mlp.transpose(&parameters.values));
     let weights = Weights { parameters: &parameters.values, transposed: &transposed };
     let mut features = vec![0.0; n * stride];
-    parts.grid.forward(&parts.table.values, x, parts.grid.levels(), &mut features, stride, 3);
+    grid.forward(&table.values, x, grid.levels(), &mut features, stride, 3);
     let mut found = vec![[0.0; 3]; n];
     let products = (2 * n * mlp.layout().map(|(inputs, outputs, ..)| inputs * outputs).sum::<usize>()) as f64 / 1e9;
     rows.row(
@@ -180,8 +258,7 @@ fn surface_rows(rows: &Rows<'_>, k: &Kernels, x: &[[f32; 3]]) {
         || {
             mlp.forward(&parameters.values, &features, stride, n, &mut cache);
             mlp.gradient(&weights, &mut cache);
-            let (table, levels) = (&parts.table.values, parts.grid.levels());
-            parts.grid.input_gradient(table, x, levels, &cache.gradient, stride, 3, &mut found);
+            grid.input_gradient(&table.values, x, grid.levels(), &cache.gradient, stride, 3, &mut found);
         },
     );
     let d_out: Vec<f32> = (0..n * mlp.out_stride()).map(|_| rng.random_range(-1.0..1.0)).collect();

@@ -1,13 +1,14 @@
-//! The hash encoding on the device.
+//! Tables of numbers at the corners of grids, on the device: the hash encoding, and dense voxels.
 
 use mb_neural::adam::Parameters;
+use mb_neural::dense_grid::DenseGrid;
 use mb_neural::hash_grid::HashGrid;
 
 use crate::context::{Buffer, Context, Work};
 use crate::kernels::Kernels;
-use crate::trained::{AdamStep, Trained};
+use crate::trained::{AdamStep, Gradient, Trained};
 
-/// The encoding.
+/// The encoding. A grid of voxels is one of a single level.
 pub struct Encoding {
     levels: u32,
     features: u32,
@@ -41,8 +42,11 @@ pub fn unit_of(scale: f32) -> f32 {
 impl Encoding {
     /// From its twin, whose features begin in column `first`.
     pub fn new(context: &Context, grid: &HashGrid, table: &Parameters, first: usize) -> Self {
-        let layout: Vec<[u32; 4]> =
-            grid.layout().iter().map(|l| [l.cells, l.offset as u32, l.entries, u32::from(l.dense)]).collect();
+        let layout: Vec<[u32; 8]> = grid
+            .layout()
+            .iter()
+            .map(|l| [l.cells, l.cells, l.cells, u32::from(l.dense), l.offset as u32, l.entries, 0, 0])
+            .collect();
         Self {
             levels: grid.levels() as u32,
             features: grid.options().features as u32,
@@ -50,6 +54,21 @@ impl Encoding {
             stride: (first + grid.width()).next_multiple_of(8) as u32,
             active_levels: grid.levels(),
             layout: context.upload(&layout),
+            table: Trained::new(context, table),
+            sums: context.zeros(2 * table.values.len()),
+        }
+    }
+
+    /// From a grid of voxels, whose samples fill the first columns of rows of this length.
+    pub fn of_voxels(context: &Context, grid: &DenseGrid, table: &Parameters, stride: usize) -> Self {
+        let [x, y, z] = grid.size.map(|n| n as u32 - 1);
+        Self {
+            levels: 1,
+            features: grid.channels as u32,
+            first: 0,
+            stride: stride as u32,
+            active_levels: 1,
+            layout: context.upload(&[x, y, z, 1, 0, 0, 0, 0]),
             table: Trained::new(context, table),
             sums: context.zeros(2 * table.values.len()),
         }
@@ -65,8 +84,13 @@ impl Encoding {
         self.stride as usize
     }
 
+    /// Numbers that an entry has.
+    pub fn features(&self) -> usize {
+        self.features as usize
+    }
+
     fn threads(&self, points: Points<'_>) -> usize {
-        points.count * self.levels as usize
+        points.count * self.levels as usize * self.features.div_ceil(4) as usize
     }
 
     /// Writes `[points, stride]` features; the padding of a row is left as it is.
@@ -112,6 +136,14 @@ impl Encoding {
 
     /// One Adam step, which clears `sums`.
     pub fn step(&self, work: &mut Work<'_>, k: &Kernels, unit: f32, step: &AdamStep) {
-        self.table.step(work, &k.adam_table, step, (4, &self.sums), (0, unit), self.table.len.div_ceil(16));
+        let gradient = Gradient { kernel: &k.adam_table, from: (4, &self.sums), scales: None, pieces: 0, unit };
+        self.table.step(work, step, &gradient, self.table.len.div_ceil(16));
+    }
+
+    /// The same, with the rates of each entry scaled by its own factor.
+    pub fn step_scaled(&self, work: &mut Work<'_>, k: &Kernels, unit: f32, step: &AdamStep, scales: &Buffer) {
+        let scales = Some((scales, self.features));
+        let gradient = Gradient { kernel: &k.adam_scaled, from: (4, &self.sums), scales, pieces: 0, unit };
+        self.table.step(work, step, &gradient, self.table.len.div_ceil(16));
     }
 }

@@ -3,22 +3,29 @@
 use crate::context::{Context, Kernel};
 
 /// Sources, by file name.
-pub const SOURCES: [(&str, &str); 9] = [
+pub const SOURCES: [(&str, &str); 15] = [
     ("adam", include_str!("kernels/adam.wgsl")),
     ("composite", include_str!("kernels/composite.wgsl")),
     ("dense", include_str!("kernels/dense.wgsl")),
     ("encode", include_str!("kernels/encode.wgsl")),
     ("field", include_str!("kernels/field.wgsl")),
+    ("frequencies", include_str!("kernels/frequencies.wgsl")),
+    ("gains", include_str!("kernels/gains.wgsl")),
+    ("importance", include_str!("kernels/importance.wgsl")),
     ("keep", include_str!("kernels/keep.wgsl")),
     ("march", include_str!("kernels/march.wgsl")),
+    ("sections", include_str!("kernels/sections.wgsl")),
+    ("skip", include_str!("kernels/skip.wgsl")),
     ("surface", include_str!("kernels/surface.wgsl")),
     ("tangent", include_str!("kernels/tangent.wgsl")),
+    ("voxels", include_str!("kernels/voxels.wgsl")),
 ];
 
 /// All entry points. Each has the name that its file gives it, or of what it computes.
 #[allow(missing_docs, reason = "the kernels' own files describe them")]
 pub struct Kernels {
     pub adam_table: Kernel,
+    pub adam_scaled: Kernel,
     pub adam_network: Kernel,
     pub losses: Kernel,
     pub layer: Kernel,
@@ -37,26 +44,69 @@ pub struct Kernels {
     pub join_sdf: Kernel,
     pub count_kept: Kernel,
     pub compact: Kernel,
-    pub count: Kernel,
-    pub place: Kernel,
-    pub count_inside: Kernel,
-    pub place_inside: Kernel,
+    /// `count` and `place`, where rays may be sampled.
+    pub contracted: [Kernel; 2],
+    pub inside_ball: [Kernel; 2],
+    pub voxels: [Kernel; 2],
+    pub voxels_inside: [Kernel; 2],
     pub surface_losses: Kernel,
     pub free_points: Kernel,
     pub first_gradient: Kernel,
     pub turn: Kernel,
     pub join_tangent: Kernel,
+    pub density_of_frequencies: Kernel,
+    pub split_frequencies: Kernel,
+    pub join_frequencies: Kernel,
+    pub place_samples: Kernel,
+    pub draw_samples: Kernel,
+    pub append: Kernel,
+    pub add_skipped: Kernel,
+    pub frequencies_of_positions: Kernel,
+    pub frequencies_of_directions: Kernel,
+    pub normals_of_frequencies: Kernel,
+    pub tangent_of_frequencies: Kernel,
+    pub sum_up: Kernel,
+    pub send_to_lengths: Kernel,
+    pub normalise: Kernel,
+    pub points_of_rays: Kernel,
+    pub first_distances: Kernel,
+    pub draw_round: Kernel,
+    pub merge_round: Kernel,
+    pub count_sections: Kernel,
+    pub place_sections: Kernel,
+    pub section_losses: Kernel,
+    pub count_bright: Kernel,
+    pub voxel_losses: Kernel,
 }
 
 impl Kernels {
     /// Compiles them.
     pub fn new(context: &Context) -> Self {
-        let [adam, composite, dense, encode, field, keep, march, surface, tangent] = SOURCES.map(|(_, source)| source);
+        let [
+            adam,
+            composite,
+            dense,
+            encode,
+            field,
+            frequencies,
+            gains,
+            importance,
+            keep,
+            march,
+            sections,
+            skip,
+            surface,
+            tangent,
+            voxels,
+        ] = SOURCES.map(|(_, source)| source);
         let kernel = |source, entry| context.kernel(source, entry, &[]);
         let product = |number| context.kernel(dense, "multiply", &[("product", number)]);
-        let walk = |entry, inside| context.kernel(march, entry, &[("inside_ball", inside)]);
+        let walk = |inside, voxels| {
+            ["count", "place"].map(|entry| context.kernel(march, entry, &[("inside_ball", inside), ("voxels", voxels)]))
+        };
         Self {
             adam_table: kernel(adam, "table"),
+            adam_scaled: kernel(adam, "scaled"),
             adam_network: kernel(adam, "network"),
             losses: kernel(composite, "losses_of_rays"),
             layer: product(0.0),
@@ -75,15 +125,38 @@ impl Kernels {
             join_sdf: kernel(field, "join_sdf"),
             count_kept: kernel(keep, "count"),
             compact: kernel(keep, "compact"),
-            count: walk("count", 0.0),
-            place: walk("place", 0.0),
-            count_inside: walk("count", 1.0),
-            place_inside: walk("place", 1.0),
+            contracted: walk(0.0, 0.0),
+            inside_ball: walk(1.0, 0.0),
+            voxels: walk(0.0, 1.0),
+            voxels_inside: walk(1.0, 1.0),
             surface_losses: kernel(surface, "losses_of_rays"),
             free_points: kernel(surface, "free_points"),
             first_gradient: kernel(tangent, "first"),
             turn: kernel(tangent, "turn"),
             join_tangent: kernel(tangent, "join"),
+            density_of_frequencies: kernel(field, "density_of_frequencies"),
+            split_frequencies: kernel(field, "split_frequencies"),
+            join_frequencies: kernel(field, "join_frequencies"),
+            place_samples: kernel(importance, "place"),
+            draw_samples: kernel(importance, "draw"),
+            append: kernel(skip, "append"),
+            add_skipped: kernel(skip, "add"),
+            frequencies_of_positions: kernel(frequencies, "of_positions"),
+            frequencies_of_directions: kernel(frequencies, "of_directions"),
+            normals_of_frequencies: kernel(frequencies, "normals_of"),
+            tangent_of_frequencies: kernel(frequencies, "tangent"),
+            sum_up: kernel(gains, "sum_up"),
+            send_to_lengths: kernel(gains, "send"),
+            normalise: kernel(gains, "normalise"),
+            points_of_rays: kernel(sections, "points"),
+            first_distances: kernel(sections, "first"),
+            draw_round: kernel(sections, "draw"),
+            merge_round: kernel(sections, "merge"),
+            count_sections: kernel(sections, "count"),
+            place_sections: kernel(sections, "place"),
+            section_losses: kernel(surface, "losses_of_sections"),
+            count_bright: kernel(voxels, "count"),
+            voxel_losses: kernel(voxels, "losses_of_rays"),
         }
     }
 }

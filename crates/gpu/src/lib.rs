@@ -13,32 +13,45 @@
 //! Every kernel has a twin on the processor, to which the tests compare it. Sums that meet in one place are added as
 //! whole numbers or in a fixed order, so a run's result does not depend on the order of threads.
 //!
-//! Limits: `nerf` and `neus` of the preset `fast`, with fixed cameras; rendering and extraction run on the processor.
+//! Limits: fixed cameras; a hash encoding in `neus` of the preset `fast` and frequencies in that of `paper`; rendering and extraction run on the processor.
 
 use std::str::FromStr;
 
 use mb_job::{Error, Result};
 use mb_neural::device::{Device, Processor};
+use mb_neural::sdf_field::PositionEncoding;
 use mb_neural::{FieldOptions, Method};
 
 #[cfg(feature = "wgpu")]
 pub mod context;
 #[cfg(feature = "wgpu")]
+mod dvgo;
+#[cfg(feature = "wgpu")]
 pub mod encoding;
+#[cfg(feature = "wgpu")]
+mod frequencies;
+#[cfg(feature = "wgpu")]
+mod frequency_field;
 #[cfg(feature = "wgpu")]
 pub mod kernels;
 #[cfg(feature = "wgpu")]
 mod nerf;
 #[cfg(feature = "wgpu")]
+mod nerf_original;
+#[cfg(feature = "wgpu")]
 pub mod network;
 #[cfg(feature = "wgpu")]
 mod neus;
+#[cfg(feature = "wgpu")]
+mod neus_original;
 #[cfg(feature = "wgpu")]
 mod on_device;
 #[cfg(feature = "wgpu")]
 mod radiance;
 #[cfg(feature = "wgpu")]
 mod rays;
+#[cfg(feature = "wgpu")]
+mod surface;
 #[cfg(all(test, feature = "wgpu"))]
 mod tests;
 #[cfg(feature = "wgpu")]
@@ -87,13 +100,18 @@ pub fn device(choice: DeviceChoice, options: &FieldOptions) -> Result<Box<dyn De
 
 /// Why no GPU can train it.
 fn unsupported(options: &FieldOptions) -> Option<&'static str> {
+    let hashed = |position| matches!(position, PositionEncoding::Hash(_));
     match &options.method {
         _ if options.cameras.refine_poses || options.cameras.refine_focal => {
             Some("a GPU cannot correct cameras in training yet")
         }
-        Method::Nerf(_) => None,
-        Method::Neus(neus) if neus.field.is_plain() => None,
-        _ => Some("a GPU trains only nerf and neus with the preset fast yet"),
+        Method::Neus(neus) if !hashed(neus.field.position) => {
+            Some("a GPU trains neus with frequencies only as published, with the preset paper")
+        }
+        Method::NeusOriginal(neus) if hashed(neus.field.position) => {
+            Some("a GPU trains neus on a hash encoding only with the preset fast")
+        }
+        _ => None,
     }
 }
 
@@ -135,18 +153,29 @@ impl Device for Gpu {
         options: &FieldOptions,
         data: &mb_neural::dataset::RayDataset,
     ) -> Result<Box<dyn mb_neural::model::Model>> {
+        use mb_neural::dvgo::Dvgo;
+        use mb_neural::nerf::Nerf;
+        use mb_neural::nerf_original::NerfOriginal;
+        use mb_neural::neus::Neus;
+        use mb_neural::neus_original::NeusOriginal;
         use on_device::OnDevice;
-        match (&options.method, unsupported(options)) {
-            (Method::Nerf(nerf), None) => {
-                let twin = mb_neural::nerf::Nerf::new(nerf.clone(), data);
-                Ok(Box::new(OnDevice(nerf::GpuNerf::new(twin, self.0.clone()))))
-            }
-            (Method::Neus(neus), None) => {
-                let twin = mb_neural::neus::Neus::new(neus.clone(), data);
-                Ok(Box::new(OnDevice(neus::GpuNeus::new(twin, self.0.clone()))))
-            }
-            (_, why) => Err(Error::Failed(format!("{}. Use --device cpu", why.unwrap_or("the GPU lacks the method")))),
+        if let Some(why) = unsupported(options) {
+            return Err(Error::Failed(format!("{why}. Use --device cpu")));
         }
+        let context = self.0.clone();
+        Ok(match &options.method {
+            Method::Nerf(o) => Box::new(OnDevice(nerf::GpuNerf::new(Nerf::new(o.clone(), data), context))),
+            Method::NerfOriginal(o) => {
+                let twin = NerfOriginal::new(o.clone(), data);
+                Box::new(OnDevice(nerf_original::GpuNerfOriginal::new(twin, context)))
+            }
+            Method::Dvgo(o) => Box::new(OnDevice(dvgo::GpuDvgo::new(Dvgo::new(o.clone(), data), context))),
+            Method::Neus(o) => Box::new(OnDevice(neus::GpuNeus::new(Neus::new(o.clone(), data), context))),
+            Method::NeusOriginal(o) => {
+                let twin = NeusOriginal::new(o.clone(), data);
+                Box::new(OnDevice(neus_original::GpuNeusOriginal::new(twin, context)))
+            }
+        })
     }
 }
 
@@ -159,9 +188,10 @@ mod choices {
         assert_eq!("auto".parse(), Ok(DeviceChoice::Auto));
         assert_eq!("gpu:3".parse(), Ok(DeviceChoice::Gpu(Some(3))));
         assert!("gpu:x".parse::<DeviceChoice>().is_err() && "".parse::<DeviceChoice>().is_err());
-        let dvgo = FieldOptions::preset("dvgo", "fast", 0).expect("a preset");
-        let Err(error) = device(DeviceChoice::Gpu(None), &dvgo) else { panic!("no GPU trains dvgo") };
+        let mut neus = FieldOptions::preset("neus", "paper", 0).expect("a preset");
+        neus.cameras.refine_poses = true;
+        let Err(error) = device(DeviceChoice::Gpu(None), &neus) else { panic!("no GPU corrects cameras") };
         assert!(error.to_string().contains("--device cpu"), "{error}");
-        assert_eq!(device(DeviceChoice::Auto, &dvgo).expect("the processor").name(), "the processor");
+        assert_eq!(device(DeviceChoice::Auto, &neus).expect("the processor").name(), "the processor");
     }
 }

@@ -55,10 +55,7 @@ impl GpuNerf {
             data.draw(&mut rng, self.twin.rays_of_group(), cameras, &mut rays);
             packed.extend(rays.iter().map(|target| {
                 let background: [f32; 3] = std::array::from_fn(|_| rng.random());
-                let wanted = match target.mask.filter(|_| options.object_only) {
-                    Some(mask) => std::array::from_fn(|c| mask * target.rgb[c] + (1.0 - mask) * background[c]),
-                    None => target.rgb,
-                };
+                let wanted = target.before(background, options.object_only);
                 pack(target, rng.random(), background, wanted, options.near)
             }));
         }
@@ -67,7 +64,7 @@ impl GpuNerf {
 
     fn space(&self) -> Space {
         let o = &self.twin.options;
-        Space { resolution: o.occupancy, far: o.far, step: o.step, cone: o.cone, inside_ball: false }
+        Space { resolution: o.occupancy, far: o.far, step: o.step, cone: o.cone, inside_ball: false, voxels: None }
     }
 
     /// Forward, loss, backward and Adam; the losses stay in `self.losses`.
@@ -93,7 +90,7 @@ impl GpuNerf {
             (8, &f.d_color),
             (9, &self.losses),
         ];
-        work.run(&k.losses, &[count as u32, floats[0], floats[1], floats[2]], &losses, count);
+        work.run(&k.losses, &[count as u32, floats[0], floats[1], floats[2], 0], &losses, count);
         let unit = unit_of(scale);
         f.backward(&mut work, k, s, unit);
         f.step(&mut work, k, unit, lr, t);

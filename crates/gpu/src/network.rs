@@ -1,18 +1,26 @@
-//! A fully connected network on the device: its layers, their derivatives, and the derivatives of its gradient.
+//! A fully connected network on the device: its layers, their derivatives, and the derivatives of its gradient; with or
+//! without weight normalisation.
 
+use mb_job::Result;
 use mb_neural::adam::Parameters;
 use mb_neural::mlp::{Activation, Mlp};
+use mb_neural::network::Network as Twin;
 
 use crate::context::{Buffer, Context, Kernel, WORKGROUP, Work};
 use crate::kernels::Kernels;
-use crate::trained::{AdamStep, Trained};
+use crate::trained::{AdamStep, Gradient, Trained};
 
 struct Layer {
     inputs: usize,
     in_stride: usize,
     outputs: usize,
+    /// Row length of the weights, and of `out`.
+    weight_stride: usize,
     out_stride: usize,
     weights: usize,
+    /// Inputs that the layer before gives; behind them a skip layer has the network's. The scale of both.
+    own: usize,
+    scale: f32,
     /// The layer's output and the derivative of its input, for each sample.
     out: Buffer,
     d_input: Buffer,
@@ -26,12 +34,23 @@ struct Second {
     joins: Buffer,
 }
 
+/// Weight normalisation: the lengths of the weights, and what follows from them; see `gains.wgsl`.
+struct Gains {
+    lengths: Trained,
+    columns: Buffer,
+    /// The weights in use, their gradient, and that of the lengths.
+    weights: Buffer,
+    d_weights: Buffer,
+    d_lengths: Buffer,
+}
+
 /// A network.
 pub struct Network {
     layers: Vec<Layer>,
     activation: Activation,
-    /// Laid out as the twin's.
+    /// Laid out as the twin's; directions of the weights, where they are normalised.
     pub parameters: Trained,
+    gains: Option<Gains>,
     /// `[pieces, parameters]`: sums of the gradient.
     pub partial_sums: Buffer,
     pieces: usize,
@@ -63,35 +82,76 @@ struct Product<'a> {
     activated: bool,
     tangent: bool,
     unit: bool,
+    /// What the layer's output is scaled by, which is a skip layer's part of its input.
+    out_scale: f32,
     threads: usize,
 }
 
 impl Network {
     /// From its twin. `second_order` networks give a gradient that losses may use.
-    ///
-    /// # Panics
-    /// The twin has a skip layer, or is of second order and has no softplus.
-    pub fn new(context: &Context, mlp: &Mlp, parameters: &Parameters, second_order: bool) -> Self {
-        let shape = mlp.shape();
-        assert!(shape.skip.is_none(), "{shape:?}");
-        assert!(!second_order || matches!(shape.activation, Activation::Softplus { .. }), "{shape:?}");
-        let mut in_stride = mlp.in_stride();
-        let none = || context.zeros(0);
-        let layers = mlp
+    pub fn of_twin(context: &Context, k: &Kernels, twin: &Twin, second_order: bool) -> Self {
+        let mut network = Self::new(context, twin.mlp(), twin.direct(), second_order);
+        let lengths = twin.gains();
+        if lengths.values.is_empty() {
+            return network;
+        }
+        let columns: Vec<[u32; 4]> = twin
+            .mlp()
             .layout()
-            .enumerate()
-            .map(|(k, (inputs, outputs, out_stride, weights, _))| {
-                let second = (second_order && k < shape.hidden).then(|| Second { r: none(), q: none(), joins: none() });
-                let layer =
-                    Layer { inputs, in_stride, outputs, out_stride, weights, out: none(), d_input: none(), second };
-                in_stride = out_stride;
-                layer
+            .flat_map(|(inputs, outputs, stride, weights, _)| {
+                (0..outputs).map(move |o| [weights + o, stride, inputs, 0].map(|n| n as u32))
             })
             .collect();
+        network.gains = Some(Gains {
+            lengths: Trained::new(context, lengths),
+            columns: context.upload(&columns),
+            weights: context.zeros(twin.direct().values.len()),
+            d_weights: context.zeros(twin.direct().values.len()),
+            d_lengths: context.zeros(lengths.values.len()),
+        });
+        let mut work = context.work();
+        network.normalise(&mut work, k);
+        work.submit();
+        network
+    }
+
+    /// From its twin, whose weights are not normalised.
+    ///
+    /// # Panics
+    /// The twin is of second order and has no softplus.
+    pub fn new(context: &Context, mlp: &Mlp, parameters: &Parameters, second_order: bool) -> Self {
+        let shape = mlp.shape();
+        assert!(!second_order || matches!(shape.activation, Activation::Softplus { .. }), "{shape:?}");
+        let none = || context.zeros(0);
+        let mut own = shape.inputs;
+        let mut layers: Vec<Layer> = Vec::new();
+        for (k, (inputs, outputs, weight_stride, weights, _)) in mlp.layout().enumerate() {
+            let second = (second_order && k < shape.hidden).then(|| Second { r: none(), q: none(), joins: none() });
+            let skip = shape.skip.filter(|skip| skip.layer == k);
+            let in_stride = inputs.next_multiple_of(8);
+            if let Some(before) = layers.last_mut() {
+                before.out_stride = in_stride;
+            }
+            layers.push(Layer {
+                inputs,
+                in_stride,
+                outputs,
+                weight_stride,
+                out_stride: weight_stride,
+                weights,
+                own,
+                scale: if skip.is_some_and(|skip| skip.narrow) { std::f32::consts::FRAC_1_SQRT_2 } else { 1.0 },
+                out: none(),
+                d_input: none(),
+                second,
+            });
+            own = outputs;
+        }
         Self {
             layers,
             activation: shape.activation,
             parameters: Trained::new(context, parameters),
+            gains: None,
             partial_sums: none(),
             pieces: 0,
             gradient: none(),
@@ -132,6 +192,11 @@ impl Network {
         &self.layers[0].d_input
     }
 
+    /// The weights in use.
+    fn weights(&self) -> &Buffer {
+        self.gains.as_ref().map_or(&self.parameters.values, |gains| &gains.weights)
+    }
+
     fn beta(&self) -> f32 {
         match self.activation {
             Activation::Relu => 0.0,
@@ -150,7 +215,7 @@ impl Network {
             layer.inputs as u32,
             layer.in_stride as u32,
             layer.outputs as u32,
-            layer.out_stride as u32,
+            layer.weight_stride as u32,
             layer.weights as u32,
             activation,
             self.parameters.len as u32,
@@ -158,8 +223,12 @@ impl Network {
             self.beta().to_bits(),
             u32::from(p.tangent),
             u32::from(p.unit),
+            layer.out_stride as u32,
+            layer.own as u32,
+            layer.scale.to_bits(),
+            p.out_scale.to_bits(),
         ];
-        let buffers = [(1, &self.parameters.values), (2, p.x), (3, p.z), (4, p.dx), (5, &self.partial_sums)];
+        let buffers = [(1, self.weights()), (2, p.x), (3, p.z), (4, p.dx), (5, &self.partial_sums)];
         work.run(p.kernel, &sizes, &buffers, p.threads);
     }
 
@@ -174,7 +243,8 @@ impl Network {
             activated: !tangent && i + 1 < self.layers.len(),
             tangent,
             unit: false,
-            threads: threads_of(rows, layer.out_stride),
+            out_scale: self.layers.get(i + 1).map_or(1.0, |next| next.scale),
+            threads: threads_of(rows, layer.weight_stride),
         };
         self.product(work, layer, rows, &p);
     }
@@ -183,11 +253,21 @@ impl Network {
     fn input_gradient(&self, work: &mut Work<'_>, k: &Kernels, i: usize, [x, z, dx]: [&Buffer; 3], rows: usize) {
         let layer = &self.layers[i];
         let threads = threads_of(rows, layer.inputs);
-        let p = Product { kernel: &k.input_gradient, x, z, dx, activated: i > 0, tangent: false, unit: false, threads };
+        let p = Product {
+            kernel: &k.input_gradient,
+            x,
+            z,
+            dx,
+            activated: i > 0,
+            tangent: false,
+            unit: false,
+            out_scale: 1.0,
+            threads,
+        };
         self.product(work, layer, rows, &p);
     }
 
-    /// `x^T dz` of a layer; tangents add to what is there.
+    /// Adds `x^T dz` of a layer to the partial sums.
     fn weight_gradient(
         &self,
         work: &mut Work<'_>,
@@ -207,7 +287,8 @@ impl Network {
             activated: false,
             tangent,
             unit: tangent && i + 1 == self.layers.len(),
-            threads: rows.div_ceil(piece_of(rows)) * threads_of(height, layer.out_stride),
+            out_scale: 1.0,
+            threads: rows.div_ceil(piece_of(rows)) * threads_of(height, layer.weight_stride),
         };
         self.product(work, layer, rows, &p);
     }
@@ -217,11 +298,23 @@ impl Network {
         let mut x = input;
         for (i, layer) in self.layers.iter().enumerate() {
             self.layer(work, k, i, [x, &layer.out], rows, false);
+            self.skip(work, &k.append, i + 1, [input, &layer.out], rows);
             x = &layer.out;
         }
     }
 
-    /// Computes [`Self::d_input`] and the partial sums of the parameters' gradient, after [`Self::forward`].
+    /// Where layer `i` is a skip layer: copies the network's input behind its own, or adds that part of its derivative to
+    /// the input's.
+    fn skip(&self, work: &mut Work<'_>, kernel: &Kernel, i: usize, [input, here]: [&Buffer; 2], rows: usize) {
+        let Some(layer) = self.layers.get(i).filter(|layer| layer.own < layer.inputs) else { return };
+        let inputs = layer.inputs - layer.own;
+        let sizes = [rows, inputs, self.layers[0].in_stride, layer.own, layer.in_stride].map(|n| n as u32);
+        let sizes: Vec<u32> = sizes.into_iter().chain([layer.scale.to_bits()]).collect();
+        work.run(kernel, &sizes, &[(1, input), (2, here)], rows * inputs);
+    }
+
+    /// Computes [`Self::d_input`] and adds to the partial sums of the parameters' gradient, which [`Self::step`] clears,
+    /// after [`Self::forward`].
     pub fn backward(&self, work: &mut Work<'_>, k: &Kernels, input: &Buffer, d_out: &Buffer, rows: usize) {
         let mut dz = d_out;
         for (i, layer) in self.layers.iter().enumerate().rev() {
@@ -234,6 +327,9 @@ impl Network {
                 });
             }
             dz = &layer.d_input;
+        }
+        for (i, layer) in self.layers.iter().enumerate() {
+            self.skip(work, &k.add_skipped, i, [self.d_input(), &layer.d_input], rows);
         }
     }
 
@@ -248,8 +344,9 @@ impl Network {
     ) {
         let (layer, next) = (&self.layers[i], &self.layers[i + 1]);
         let Some(second) = &layer.second else { return };
-        let (width, outputs) = (layer.out_stride as u32, layer.outputs as u32);
-        let sizes = [rows as u32, width, self.beta().to_bits(), next.weights as u32, next.out_stride as u32, outputs];
+        let [rows_, width, weights, stride, own, inputs] =
+            [rows, layer.out_stride, next.weights, next.weight_stride, next.own, next.inputs].map(|n| n as u32);
+        let sizes = [rows_, width, self.beta().to_bits(), weights, stride, own, inputs, next.scale.to_bits()];
         work.run(kernel, &sizes, &buffers(layer, second), rows * layer.out_stride);
     }
 
@@ -257,7 +354,7 @@ impl Network {
     pub fn gradient(&self, work: &mut Work<'_>, k: &Kernels, input: &Buffer, rows: usize) {
         let last = self.layers.len() - 1;
         self.between(work, &k.first_gradient, last - 1, rows, |layer, second| {
-            vec![(1, &self.parameters.values), (2, &layer.out), (3, &second.r)]
+            vec![(1, self.weights()), (2, &layer.out), (3, &second.r)]
         });
         for i in (0..last).rev() {
             let Some(Second { r, .. }) = &self.layers[i].second else { return };
@@ -269,6 +366,11 @@ impl Network {
                 },
             };
             self.input_gradient(work, k, i, [x, r, dx], rows);
+        }
+        for (i, layer) in self.layers.iter().enumerate() {
+            if let Some(Second { r, .. }) = &layer.second {
+                self.skip(work, &k.add_skipped, i + 1, [&self.gradient, r], rows);
+            }
         }
     }
 
@@ -289,6 +391,7 @@ impl Network {
             self.between(work, &k.turn, i, rows, |layer, second| {
                 vec![(2, &layer.out), (3, &second.r), (4, &second.q), (5, &second.joins)]
             });
+            self.skip(work, &k.append, i + 1, [d_gradient, q], rows);
             q_here = q;
         }
         self.backward(work, k, input, d_out, rows);
@@ -303,9 +406,48 @@ impl Network {
         }
     }
 
-    /// One Adam step.
+    /// One Adam step, with all that was added since the last one, and the weights that follow from it.
     pub fn step(&self, work: &mut Work<'_>, k: &Kernels, step: &AdamStep) {
-        let pieces = (self.pieces, 0.0);
-        self.parameters.step(work, &k.adam_network, step, (5, &self.partial_sums), pieces, self.parameters.len);
+        let gradient =
+            |sums, pieces| Gradient { kernel: &k.adam_network, from: (5, sums), scales: None, pieces, unit: 0.0 };
+        let len = self.parameters.len;
+        let Some(gains) = &self.gains else {
+            self.parameters.step(work, step, &gradient(&self.partial_sums, self.pieces), len);
+            return;
+        };
+        let summed = [(4, &self.partial_sums), (5, &gains.d_weights)];
+        work.run(&k.sum_up, &[0, len as u32, self.pieces as u32], &summed, len);
+        let lengths = &gains.lengths;
+        let sent = [
+            (1, &gains.columns),
+            (2, &self.parameters.values),
+            (3, &lengths.values),
+            (5, &gains.d_weights),
+            (6, &gains.d_lengths),
+        ];
+        work.run(&k.send_to_lengths, &[lengths.len as u32, 0, 0], &sent, lengths.len);
+        self.parameters.step(work, step, &gradient(&gains.d_weights, 1), len);
+        lengths.step(work, step, &gradient(&gains.d_lengths, 1), lengths.len);
+        self.normalise(work, k);
+    }
+
+    /// Works out the weights in use, where they are normalised.
+    fn normalise(&self, work: &mut Work<'_>, k: &Kernels) {
+        let Some(gains) = &self.gains else { return };
+        let (values, lengths) = (&self.parameters.values, &gains.lengths);
+        let buffers = [(1, &gains.columns), (2, values), (3, &lengths.values), (7, &gains.weights)];
+        work.run(&k.normalise, &[lengths.len as u32, 0, 0], &buffers, lengths.len);
+    }
+
+    /// Brings what was learned to the twin.
+    ///
+    /// # Errors
+    /// As [`Context::read`].
+    pub fn fetch(&self, context: &Context, twin: &mut Twin) -> Result<()> {
+        let [direct, lengths] = twin.parts_mut();
+        self.parameters.fetch(context, direct)?;
+        self.gains.as_ref().map_or(Ok(()), |gains| gains.lengths.fetch(context, lengths))?;
+        twin.refresh();
+        Ok(())
     }
 }

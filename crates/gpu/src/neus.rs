@@ -10,142 +10,16 @@ use mb_neural::model::{GROUPS, StepReport};
 use mb_neural::neus::{DARK, FREE_POINTS, Neus, SHORTEST_OUTER_STEP, nearness};
 use mb_neural::occupancy::{CELL_MEMORY, looks_everywhere};
 use mb_neural::radiance_field::ADAM;
-use mb_neural::sdf_field::{SdfField, SdfParts};
 use rand::RngExt as _;
 
-use crate::context::{Buffer, Context, Work};
-use crate::encoding::{Encoding, Points, unit_of};
+use crate::context::{Buffer, Context};
+use crate::encoding::unit_of;
 use crate::kernels::Kernels;
-use crate::network::Network;
 use crate::on_device::Learner;
 use crate::radiance::Radiance;
-use crate::rays::{RAY, Samples, Space, occupied, pack, starts};
+use crate::rays::{RAY, Samples, Space, occupied, pack};
+use crate::surface::Surface;
 use crate::trained::AdamStep;
-
-/// Points that are asked for their distance at once.
-const POINTS: usize = 1 << 18;
-
-/// A distance field on the device. Twin: [`SdfField`].
-struct Surface {
-    encoding: Encoding,
-    geometry: Network,
-    color: Network,
-    /// Features that the colour network gets, and the row length of its input.
-    features: usize,
-    color_stride: usize,
-    encoded: Buffer,
-    color_in: Buffer,
-    normals: Buffer,
-    d_sdf: Buffer,
-    d_color: Buffer,
-    d_out: Buffer,
-    d_gradient: Buffer,
-}
-
-impl Surface {
-    fn new(context: &Context, parts: &SdfParts<'_>) -> Self {
-        let none = || context.zeros(0);
-        let ((geometry, geometry_parameters), (color, color_parameters)) = (parts.geometry, parts.color);
-        Self {
-            encoding: Encoding::new(context, parts.grid, parts.table, 3),
-            geometry: Network::new(context, geometry, geometry_parameters, true),
-            color: Network::new(context, color, color_parameters, false),
-            features: geometry.shape().outputs - 1,
-            color_stride: color.in_stride(),
-            encoded: none(),
-            color_in: none(),
-            normals: none(),
-            d_sdf: none(),
-            d_color: none(),
-            d_out: none(),
-            d_gradient: none(),
-        }
-    }
-
-    fn reserve(&mut self, context: &Context, n: usize) {
-        let (stride, out_stride) = (self.encoding.stride(), self.geometry.out_stride());
-        for (buffer, width) in [
-            (&mut self.encoded, stride),
-            (&mut self.color_in, self.color_stride),
-            (&mut self.normals, 3),
-            (&mut self.d_sdf, 1),
-            (&mut self.d_color, 8),
-            (&mut self.d_out, out_stride),
-            (&mut self.d_gradient, stride),
-        ] {
-            context.reserve(buffer, n * width);
-        }
-        self.geometry.reserve(context, n);
-        self.color.reserve(context, n);
-    }
-
-    /// The geometry network's output, whose first number is the distance.
-    fn distance(&self, work: &mut Work<'_>, k: &Kernels, points: Points<'_>) {
-        self.encoding.forward(work, k, points, &self.encoded);
-        self.geometry.forward(work, k, &self.encoded, points.count);
-    }
-
-    /// Distances of points of the unit cube.
-    fn distances(&mut self, context: &Context, k: &Kernels, points: &[[f32; 3]]) -> Result<Vec<f32>> {
-        let mut found = Vec::with_capacity(points.len());
-        for points in points.chunks(POINTS) {
-            let (n, stride) = (points.len(), self.geometry.out_stride());
-            self.reserve(context, n);
-            let positions = context.upload(points.as_flattened());
-            let mut work = context.work();
-            self.distance(&mut work, k, Points { positions: &positions, count: n });
-            work.submit();
-            let rows: Vec<f32> = context.read(self.geometry.out(), n * stride)?;
-            found.extend(rows.chunks_exact(stride).map(|row| row[0]));
-        }
-        Ok(found)
-    }
-
-    /// Sizes of `split_sdf` and `join_sdf`: `rows` samples, of which the first `colored` have a colour.
-    fn sizes(&self, rows: usize, colored: usize) -> [u32; 7] {
-        [rows, 0, colored, self.features, self.geometry.out_stride(), self.encoding.stride(), self.color_stride]
-            .map(|n| n as u32)
-    }
-
-    /// Distances and normals of all rows, colours of the first ones, which belong to rays.
-    fn forward(&self, work: &mut Work<'_>, k: &Kernels, rays: &Buffer, s: &Samples, rows: usize) {
-        let points = s.points(rows);
-        self.distance(work, k, points);
-        self.geometry.gradient(work, k, &self.encoded, rows);
-        self.encoding.normals(work, k, points, &self.geometry.gradient, &self.normals);
-        let split = [
-            (1, rays),
-            (2, &s.ray_of),
-            (4, self.geometry.out()),
-            (5, &self.color_in),
-            (8, &self.encoded),
-            (9, &self.normals),
-        ];
-        work.run(&k.split_sdf, &self.sizes(rows, s.len), &split, s.len);
-        self.color.forward(work, k, &self.color_in, s.len);
-    }
-
-    /// Sends `d_sdf`, `d_color` and what the normals have become, their derivatives, back.
-    fn backward(&self, work: &mut Work<'_>, k: &Kernels, s: &Samples, rows: usize, unit: f32) {
-        self.color.backward(work, k, &self.color_in, &self.d_color, s.len);
-        let join = [(4, &self.d_out), (5, self.color.d_input()), (6, &self.d_sdf), (9, &self.normals)];
-        work.run(&k.join_sdf, &self.sizes(rows, s.len), &join, rows);
-        let points = s.points(rows);
-        self.encoding.tangent(work, k, points, &self.normals, &self.d_gradient);
-        self.geometry.double_backward(work, k, &self.encoded, [&self.d_out, &self.d_gradient], rows);
-        let second = (&self.geometry.gradient, &self.normals);
-        self.encoding.scatter_both(work, k, points, self.geometry.d_input(), second, unit);
-    }
-
-    fn fetch(&self, context: &Context, field: &mut SdfField) -> Result<()> {
-        let [table, geometry, color] = field.parts_mut();
-        self.encoding.table.fetch(context, table)?;
-        self.geometry.parameters.fetch(context, geometry)?;
-        self.color.parameters.fetch(context, color)?;
-        field.refresh();
-        Ok(())
-    }
-}
 
 /// A NeuS whose twin holds all that is not of the device, and, after a fetch, all that the device has learned.
 pub struct GpuNeus {
@@ -169,21 +43,15 @@ struct Drawn {
     free: Vec<[f32; 3]>,
 }
 
-fn plain_parts(twin: &Neus) -> SdfParts<'_> {
-    twin.field.parts().expect("only plain fields come here")
-}
-
 impl GpuNeus {
     /// From its twin, which may have been trained.
-    ///
-    /// # Panics
-    /// Its field is not plain: see [`mb_neural::sdf_field::SdfFieldOptions::is_plain`].
     pub fn new(twin: Neus, context: Arc<Context>) -> Self {
         let c = &*context;
-        let surface = Surface::new(c, &plain_parts(&twin));
+        let kernels = Kernels::new(c);
+        let surface = Surface::new(c, &kernels, &twin.field);
         let outside = Radiance::new(c, &twin.outside, &twin.outside_parameters, twin.options.occupancy);
         Self {
-            kernels: Kernels::new(c),
+            kernels,
             surface,
             outside,
             inner_cells: occupied(c, &twin.inner_cells),
@@ -222,8 +90,14 @@ impl GpuNeus {
 
     fn march(&mut self, rays: &Buffer, count: usize) -> Result<()> {
         let o = &self.twin.options;
-        let inside =
-            Space { resolution: o.occupancy, far: o.far, step: self.twin.inner_step(), cone: 0.0, inside_ball: true };
+        let inside = Space {
+            resolution: o.occupancy,
+            far: o.far,
+            step: self.twin.inner_step(),
+            cone: 0.0,
+            inside_ball: true,
+            voxels: None,
+        };
         let (context, k) = (&*self.context, &self.kernels);
         self.marched.march(context, k, &inside, (rays, count), &self.inner_cells)?;
         if !self.twin.with_masks {
@@ -242,25 +116,10 @@ impl GpuNeus {
         let sizes = [count as u32, self.twin.sharpness().to_bits(), DARK.to_bits(), stride];
         let mut work = context.work();
         self.surface.distance(&mut work, k, m.points(m.len));
-        let judged = [(1, &m.starts), (2, self.surface.geometry.out()), (3, &self.inner.starts)];
+        let judged = [(1, &m.starts), (2, self.surface.geometry.out()), (3, &self.inner.starts), (9, &m.stays)];
         work.run(&k.count_kept, &sizes, &judged, count);
         work.submit();
-        let begins = starts(&context.read(&self.inner.starts, count)?);
-        self.inner.len = begins[count] as usize;
-        self.inner.starts = context.upload(&begins);
-        self.inner.reserve(context, self.inner.len + free.len());
-        let mut work = context.work();
-        let moved = [
-            (1, &m.starts),
-            (3, &self.inner.starts),
-            (4, &m.positions),
-            (5, &m.steps),
-            (6, &self.inner.positions),
-            (7, &self.inner.steps),
-            (8, &self.inner.ray_of),
-        ];
-        work.run(&k.compact, &sizes, &moved, count);
-        work.submit();
+        self.inner.keep(context, k, m, count, free.len())?;
         context.write(&self.inner.positions, 3 * self.inner.len, free.as_flattened());
         Ok(())
     }
@@ -293,7 +152,7 @@ impl GpuNeus {
             ]
             .map(f32::to_bits),
         );
-        sizes.extend([f.geometry.out_stride(), usize::from(!twin.with_masks), n, free].map(|n| n as u32));
+        sizes.extend([f.geometry.out_stride(), usize::from(!twin.with_masks), n, free, 0].map(|n| n as u32));
         let losses = [
             (1, rays),
             (2, &self.inner.starts),
@@ -317,10 +176,8 @@ impl GpuNeus {
         f.backward(&mut work, k, &self.inner, rows, unit);
         let (factor, t) = (o.schedule.factor(step + 1), step + 1);
         let table = o.table_learning_rate * factor;
-        f.encoding.step(&mut work, k, unit, &AdamStep { options: ADAM, lr: table, t });
-        for network in [&f.geometry, &f.color] {
-            network.step(&mut work, k, &AdamStep { options: ADAM, lr: o.learning_rate * factor, t });
-        }
+        let step = |lr| AdamStep { options: ADAM, lr, t };
+        f.step(&mut work, k, unit, [step(table), step(o.learning_rate * factor)]);
         if !twin.with_masks {
             out.backward(&mut work, k, &self.outer, unit);
             out.step(&mut work, k, unit, table, t);
@@ -362,7 +219,7 @@ impl Learner for GpuNeus {
 
     fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
         self.twin.set_levels(step);
-        self.surface.encoding.active_levels = self.twin.field.active_levels;
+        self.surface.set_levels(self.twin.field.active_levels);
         let Drawn { rays: packed, free } = self.draw(data, cameras, step);
         let count = packed.len();
         let rays = self.context.upload(packed.as_flattened());
@@ -391,7 +248,7 @@ impl Learner for GpuNeus {
 
     fn send(&mut self) {
         let (context, twin) = (&*self.context, &self.twin);
-        self.surface = Surface::new(context, &plain_parts(twin));
+        self.surface = Surface::new(context, &self.kernels, &twin.field);
         self.outside = Radiance::new(context, &twin.outside, &twin.outside_parameters, twin.options.occupancy);
         self.inner_cells = occupied(context, &twin.inner_cells);
         self.outer_cells = occupied(context, &twin.outer_cells);

@@ -79,9 +79,9 @@ impl Radiance {
         work.run(&k.density, &self.sizes(n), &[(4, self.density.out()), (6, &self.sigma)], n);
     }
 
-    /// The rest of the sizes is a distance field's.
-    fn sizes(&self, n: usize) -> [u32; 7] {
-        [n as u32, self.resolution as u32, 0, 0, 0, 0, 0]
+    /// The rest of the sizes is the other fields'.
+    fn sizes(&self, n: usize) -> [u32; 10] {
+        [n as u32, self.resolution as u32, 0, 0, 0, 0, 0, 0, 0, 0]
     }
 
     /// Densities and colours of samples, whose cells hear of them.

@@ -2,6 +2,7 @@
 
 use mb_job::Result;
 use mb_neural::dataset::TargetRay;
+use mb_neural::dvgo::UnitBox;
 use mb_neural::occupancy::OccupancyGrid;
 
 use crate::context::{Buffer, Context};
@@ -11,7 +12,8 @@ use crate::kernels::Kernels;
 /// Numbers of a ray; `march.wgsl` names them.
 pub const RAY: usize = 20;
 
-/// A ray as the kernels read it: with the colour that is wanted of it, and where contracted space and the ball are sampled.
+/// A ray as the kernels read it: with the colour that is wanted of it, and where contracted space is sampled; the ball is
+/// the caller's.
 pub fn pack(target: &TargetRay, jitter: f32, background: [f32; 3], wanted: [f32; 3], near: f32) -> [f32; RAY] {
     let mut out = [0.0; RAY];
     out[..3].copy_from_slice(&target.ray.origin);
@@ -21,6 +23,7 @@ pub fn pack(target: &TargetRay, jitter: f32, background: [f32; 3], wanted: [f32;
     out[10..13].copy_from_slice(&background);
     out[13] = near;
     out[16] = -1.0;
+    out[17..].copy_from_slice(&target.rgb);
     out
 }
 
@@ -51,8 +54,10 @@ pub struct Space {
     pub step: f32,
     /// A step's length as a share of the distance, where that is longer.
     pub cone: f32,
-    /// Inside the unit ball instead of contracted space.
+    /// Inside the unit ball or its cube instead of contracted space.
     pub inside_ball: bool,
+    /// The box of the unit cube that voxels fill, where samples lie in one.
+    pub voxels: Option<UnitBox>,
 }
 
 /// Samples of rays, one ray after the other.
@@ -65,6 +70,8 @@ pub struct Samples {
     pub steps: Buffer,
     /// `[samples]`.
     pub ray_of: Buffer,
+    /// `[samples]`: whether each stays, once a kernel has judged it for [`Self::keep`].
+    pub stays: Buffer,
     /// How many.
     pub len: usize,
 }
@@ -73,7 +80,7 @@ impl Samples {
     /// None.
     pub fn new(context: &Context) -> Self {
         let none = || context.zeros(0);
-        Self { starts: none(), positions: none(), steps: none(), ray_of: none(), len: 0 }
+        Self { starts: none(), positions: none(), steps: none(), ray_of: none(), stays: none(), len: 0 }
     }
 
     /// The first `count` of them, or, where more positions lie behind them, with these.
@@ -83,7 +90,8 @@ impl Samples {
 
     /// Makes room for so many samples.
     pub fn reserve(&mut self, context: &Context, samples: usize) {
-        for (buffer, width) in [(&mut self.positions, 3), (&mut self.steps, 2), (&mut self.ray_of, 1)] {
+        let Self { positions, steps, ray_of, stays, .. } = self;
+        for (buffer, width) in [(positions, 3), (steps, 2), (ray_of, 1), (stays, 1)] {
             context.reserve(buffer, samples * width);
         }
     }
@@ -102,20 +110,53 @@ impl Samples {
     ) -> Result<()> {
         let mut sizes = vec![count as u32, space.resolution as u32];
         sizes.extend([space.far, space.step, space.cone].map(f32::to_bits));
-        let [counting, placing] = match space.inside_ball {
-            true => [&k.count_inside, &k.place_inside],
-            false => [&k.count, &k.place],
+        let bounds = space.voxels.unwrap_or(UnitBox::ALL);
+        sizes.extend(bounds.low.iter().chain(&bounds.high).map(|c| c.to_bits()));
+        let [counting, placing] = match (space.voxels.is_some(), space.inside_ball) {
+            (false, false) => &k.contracted,
+            (false, true) => &k.inside_ball,
+            (true, false) => &k.voxels,
+            (true, true) => &k.voxels_inside,
         };
         context.reserve(&mut self.starts, count + 1);
         let mut work = context.work();
         work.run(counting, &sizes, &self.marched(rays, occupied), count);
         work.submit();
+        self.add_up(context, count, 0)?;
+        let mut work = context.work();
+        work.run(placing, &sizes, &self.marched(rays, occupied), count);
+        work.submit();
+        Ok(())
+    }
+
+    /// From the number of each ray's samples, in `starts`: where they begin; makes room for them, and for `more` behind them.
+    fn add_up(&mut self, context: &Context, count: usize, more: usize) -> Result<()> {
         let begins = starts(&context.read(&self.starts, count)?);
         self.len = begins[count] as usize;
         self.starts = context.upload(&begins);
-        self.reserve(context, self.len);
+        self.reserve(context, self.len + more);
+        Ok(())
+    }
+
+    /// Becomes the samples of `all` that stay, with room for `more` behind them. `starts` has the number that stay of each
+    /// of the `count` rays.
+    ///
+    /// # Errors
+    /// As [`Context::read`].
+    pub fn keep(&mut self, context: &Context, k: &Kernels, all: &Samples, count: usize, more: usize) -> Result<()> {
+        self.add_up(context, count, more)?;
         let mut work = context.work();
-        work.run(placing, &sizes, &self.marched(rays, occupied), count);
+        let moved = [
+            (1, &all.starts),
+            (3, &self.starts),
+            (4, &all.positions),
+            (5, &all.steps),
+            (6, &self.positions),
+            (7, &self.steps),
+            (8, &self.ray_of),
+            (9, &all.stays),
+        ];
+        work.run(&k.compact, &[count as u32, 0, 0, 0], &moved, count);
         work.submit();
         Ok(())
     }

@@ -1,34 +1,38 @@
 //! Every kernel beside its twin on the processor, on whatever device this machine has (in continuous integration a
-//! software one), and whole training.
+//! software one).
+
+mod training;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use mb_geometry::{Camera, ImageSize, Intrinsics, Rigid3, World};
 use mb_image::Image;
-use mb_job::{Rng, Silent, rng};
+use mb_job::{Rng, rng};
 use mb_neural::adam::{AdamOptions, Parameters};
 use mb_neural::cameras::{CameraOptions, CameraResiduals};
 use mb_neural::composite::{CompositeGradient, composite, composite_backward, distortion, opacity};
+use mb_neural::contraction::contract;
 use mb_neural::dataset::{RayDataset, TargetRay};
+use mb_neural::dense_grid::DenseGrid;
+use mb_neural::dvgo::{Dvgo, DvgoOptions, FAR, StageOptions, UnitBox};
+use mb_neural::encoding::Frequencies;
+use mb_neural::frequency_field::{DensityActivation, FrequencyField, FrequencyFieldOptions, FrequencyWorker};
 use mb_neural::hash_grid::{HashGrid, HashGridOptions, Scatter};
-use mb_neural::mlp::{Activation, Mlp, MlpCache, MlpShape, Weights};
-use mb_neural::model::Model;
+use mb_neural::mlp::{Activation, Mlp, MlpCache, MlpShape, Skip, Weights};
 use mb_neural::nerf::{DARK, Nerf, NerfOptions};
-use mb_neural::neus::{Neus, NeusOptions};
 use mb_neural::radiance_field::{ADAM, RadianceField, RadianceFieldOptions, RadianceWorker};
 use mb_neural::ray_samples::RaySamples;
-use mb_neural::sdf_field::{PositionEncoding, SdfFieldOptions};
-use mb_neural::trainer::{RunOptions, train};
+use mb_neural::sampling::importance;
+use mb_neural::voxel_field::ColorNetworkOptions;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use rand::RngExt as _;
 
-use crate::context::Context;
+use crate::context::{Buffer, Context};
 use crate::encoding::{Encoding, Points, unit_of};
+use crate::frequencies::{self, Columns, encode_directions, encode_positions};
+use crate::frequency_field::FrequencyNetworks;
 use crate::kernels::Kernels;
-use crate::nerf::GpuNerf;
 use crate::network::Network;
-use crate::neus::GpuNeus;
-use crate::on_device::OnDevice;
 use crate::radiance::Radiance;
 use crate::rays::{RAY, Samples, Space, occupied, pack, starts};
 use crate::trained::{AdamStep, Trained};
@@ -105,6 +109,281 @@ fn the_encoding_and_its_scatter_agree_with_their_twins() {
 }
 
 #[test]
+fn voxels_and_their_scatter_agree_with_their_twins() {
+    let Some((context, _guard)) = device() else { return };
+    let k = Kernels::new(&context);
+    for (channels, stride) in [(1, 1), (3, 8), (5, 24), (12, 12), (16, 40)] {
+        let grid = DenseGrid { size: [6, 4, 9], channels };
+        let mut rng = rng(channels as u64, 5);
+        let mut twin = Parameters::new(numbers(&mut rng, grid.len(), 1.0));
+        let mut x = points(&mut rng, 300);
+        x.extend([[0.5; 3]; 50]);
+        x.extend([[0.0; 3], [1.0; 3], [-0.5, 0.5, 2.0]]);
+        let n = x.len();
+        let d = numbers(&mut rng, n * stride, 1.0);
+        let mut expected = vec![0.0; n * stride];
+        grid.forward(&twin.values, &x, &mut expected, stride, 0);
+        grid.scatter(&[(&x, &d)], stride, 0, &mut twin.grads);
+        let scales: Vec<f32> = (0..grid.len() / channels).map(|_| rng.random()).collect();
+
+        let encoding = Encoding::of_voxels(&context, &grid, &twin, stride);
+        let [positions, d, factors] = [x.as_flattened(), &d, &scales].map(|content| context.upload(content));
+        let (out, unit) = (context.zeros(n * stride), unit_of(1.0));
+        let points = Points { positions: &positions, count: n };
+        let mut work = context.work();
+        encoding.forward(&mut work, &k, points, &out);
+        encoding.scatter(&mut work, &k, points, &d, unit);
+        encoding.step_scaled(&mut work, &k, unit, &adam(0.1, 1), &factors);
+        work.submit();
+        agree("values", &context.read(&out, n * stride).expect("values"), &expected, 1e-6);
+        let mut found = twin.clone();
+        encoding.table.fetch(&context, &mut found).expect("parameters");
+        // The first moment after one step is a tenth of the gradient.
+        agree("table", &found.m.iter().map(|m| 10.0 * m).collect::<Vec<_>>(), &twin.grads, 1e-5);
+        let before = twin.values.clone();
+        let options = AdamOptions { skip_untouched: true, ..ADAM };
+        twin.step_scaled(&options, 0.1, 1, Some((scales.as_slice(), channels)));
+        let moved = |now: &[f32]| now.iter().zip(&before).map(|(now, before)| now - before).collect::<Vec<_>>();
+        agree("scaled steps", &moved(&found.values), &moved(&twin.values), 1e-4);
+    }
+}
+
+#[test]
+fn frequencies_agree_with_their_twins() {
+    let Some((context, _guard)) = device() else { return };
+    let (k, n, stride) = (Kernels::new(&context), 90, 96);
+    let mut rng = rng(6, 0);
+    let direction: Vec<[f32; 3]> = points(&mut rng, 30).iter().map(|p| p.map(|c| 2.0 * c - 1.0)).collect();
+    let mut packed = vec![[0.0; RAY]; 30];
+    packed.iter_mut().zip(&direction).for_each(|(ray, d)| ray[3..6].copy_from_slice(d));
+    let mut s = Samples::new(&context);
+    (s.len, s.ray_of) = (n, context.upload(&(0..n as u32).map(|i| i / 3).collect::<Vec<_>>()));
+    let x: Vec<[f32; 4]> = (0..n).map(|_| std::array::from_fn(|_| rng.random_range(-2.0..2.0f32))).collect();
+    let mut expected = vec![0.0; n * stride];
+    // Ten octaves of four coordinates, as NeRF++ has them.
+    Frequencies(10).forward(&x.iter().map(|p| p.map(|c| c - 0.5)).collect::<Vec<_>>(), &mut expected, stride, 0);
+    let rays = context.upload(packed.as_flattened());
+    let (positions, out) = (context.upload(x.as_flattened()), context.zeros(n * stride));
+    let columns = Columns { to: &out, stride, first: 0 };
+    let read = |what: &str, expected: &[f32]| {
+        agree(what, &context.read(&out, n * stride).expect("frequencies"), expected, 1e-4);
+    };
+    let mut work = context.work();
+    encode_positions(
+        &mut work,
+        &k,
+        Frequencies(10),
+        (Points { positions: &positions, count: n }, 4),
+        [1.0, -0.5],
+        columns,
+    );
+    work.submit();
+    read("positions", &expected);
+    // Of three coordinates: J^T g and J v.
+    let x: Vec<[f32; 3]> = points(&mut rng, n);
+    let (g, v) = (numbers(&mut rng, n * stride, 1.0), points(&mut rng, n));
+    let (mut encoded, mut normals, mut tangents) = (vec![0.0; n * stride], vec![[0.0; 3]; n], vec![0.0; n * stride]);
+    Frequencies(6).forward(&x, &mut encoded, stride, 0);
+    Frequencies(6).input_gradient(&encoded, &g, stride, 0, &mut normals);
+    Frequencies(6).tangent(&encoded, &v, &mut tangents, stride, 0);
+    let [encoded, g, v] = [&encoded, &g, &v.concat()].map(|content| context.upload(content));
+    let (found_normals, found_tangents) = (context.zeros(3 * n), context.zeros(n * stride));
+    let of = Columns { to: &encoded, ..columns };
+    let mut work = context.work();
+    frequencies::normals(&mut work, &k, Frequencies(6), n, of, [&g, &found_normals]);
+    frequencies::tangent(&mut work, &k, Frequencies(6), n, of, [&v, &found_tangents]);
+    work.submit();
+    agree("normals", &context.read(&found_normals, 3 * n).expect("read"), normals.as_flattened(), 1e-5);
+    agree("tangents", &context.read(&found_tangents, n * stride).expect("read"), &tangents, 1e-5);
+    let directions: Vec<[f32; 3]> = (0..n).map(|i| direction[i / 3]).collect();
+    Frequencies(4).forward(&directions, &mut expected, stride, 60);
+    let mut work = context.work();
+    encode_directions(&mut work, &k, Frequencies(4), (&rays, &s), Columns { first: 60, ..columns });
+    work.submit();
+    read("directions", &expected);
+}
+
+#[test]
+fn importance_sampling_agrees_with_its_twin() {
+    let Some((context, _guard)) = device() else { return };
+    let (k, mut rng) = (Kernels::new(&context), rng(8, 0));
+    let (count, coarse, fine) = (70, 9, 13);
+    for inside_ball in [true, false] {
+        let mut packed = vec![[0.0; RAY]; count];
+        for ray in &mut packed {
+            ray[..6].iter_mut().for_each(|v| *v = rng.random_range(-1.0..1.0f32));
+            ray[15] = 4.0;
+        }
+        let mut depths = numbers(&mut rng, count * coarse, 1.0);
+        depths.iter_mut().enumerate().for_each(|(i, t)| *t = 0.4 * ((i % coarse) as f32 + 1.0 + 0.5 * *t));
+        let weights: Vec<f32> = (0..count * coarse).map(|_| rng.random_range(0.0f32..1.0).powi(4)).collect();
+        // The twin draws the same numbers again.
+        let mut again = rng.clone();
+        let random: Vec<f32> = (0..count * fine).map(|_| rng.random()).collect();
+        let [rays, uploaded, weight, random] =
+            [packed.as_flattened(), &depths, &weights, &random].map(|content| context.upload(content));
+        let (mut first, mut all) = (Samples::new(&context), Samples::new(&context));
+        (first.len, all.len) = (count * coarse, count * (coarse + fine));
+        let lens = [first.len, all.len];
+        [&mut first, &mut all].into_iter().zip(lens).for_each(|(s, n)| s.reserve(&context, n));
+        let sizes = [count, coarse, fine, usize::from(inside_ball)].map(|n| n as u32);
+        let mut work = context.work();
+        let placed = [(1, &rays), (2, &uploaded), (5, &first.positions), (6, &first.steps), (7, &first.ray_of)];
+        work.run(&k.place_samples, &sizes, &placed, count);
+        let drawn = [
+            (1, &rays),
+            (2, &random),
+            (3, &first.steps),
+            (4, &weight),
+            (5, &all.positions),
+            (6, &all.steps),
+            (7, &all.ray_of),
+        ];
+        work.run(&k.draw_samples, &sizes, &drawn, count);
+        work.submit();
+        let found: Vec<[f32; 2]> = context.read(&all.steps, all.len).expect("steps");
+        let positions: Vec<[f32; 3]> = context.read(&all.positions, all.len).expect("positions");
+        let ray_of: Vec<u32> = context.read(&all.ray_of, all.len).expect("rays");
+        for (i, ray) in packed.iter().enumerate() {
+            let own = &depths[i * coarse..(i + 1) * coarse];
+            let middles: Vec<f32> = own.windows(2).map(|w| 0.5 * (w[0] + w[1])).collect();
+            let mut expected = Vec::new();
+            importance(&middles, &weights[i * coarse + 1..(i + 1) * coarse - 1], fine, Some(&mut again), &mut expected);
+            expected.extend_from_slice(own);
+            expected.sort_by(f32::total_cmp);
+            for (j, t) in expected.iter().enumerate() {
+                let at = i * (coarse + fine) + j;
+                let end = expected.get(j + 1).copied().unwrap_or(4.0);
+                agree("distance and length", &found[at], &[*t, end - t], 1e-4);
+                let p: [f32; 3] = std::array::from_fn(|d| ray[d] + t * ray[3 + d]);
+                let p = if inside_ball { p } else { contract(p).map(|c| 4.0 * c - 2.0) };
+                agree("position", &positions[at], &p, 1e-4);
+                assert_eq!(ray_of[at] as usize, i);
+            }
+        }
+    }
+}
+
+fn check_frequencies<const D: usize>(context: &Context, activation: DensityActivation) {
+    let options = FrequencyFieldOptions {
+        position_octaves: 3,
+        direction_octaves: 2,
+        width: 24,
+        hidden: 3,
+        skip: 2,
+        head_width: 16,
+        activation,
+    };
+    let (field, mut rng, n) = (FrequencyField::<D>::new(&options), rng(D as u64, 3), 300);
+    let mut p = field.init(&mut rng);
+    let x: Vec<[f32; D]> = (0..n).map(|_| std::array::from_fn(|_| rng.random_range(-1.0..1.0f32))).collect();
+    let directions: Vec<[f32; 3]> = points(&mut rng, 30);
+    let runs: Vec<(u32, [f32; 3])> = directions.iter().map(|d| (10, *d)).collect();
+    let mut worker = FrequencyWorker::default();
+    field.density(&p, &x, &mut worker);
+    field.color(&p, &runs, &mut worker);
+    let (sigma, rgb) = (worker.sigma.clone(), worker.rgb.clone());
+    // The kernels take derivatives by what the networks give.
+    let slope = |sigma: f32| match activation {
+        DensityActivation::Relu => f32::from(sigma > 0.0),
+        DensityActivation::Softplus => 1.0 - (-sigma).exp(),
+    };
+    let (d_sigma, d_rgb) = (numbers(&mut rng, n, 1.0), numbers(&mut rng, 3 * n, 1.0));
+    worker.d_sigma = d_sigma.clone();
+    worker.d_rgb = d_rgb.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect();
+    field.backward(&p, &field.transpose(&p), &mut worker);
+    field.collect(&mut p, std::iter::once(&mut worker));
+
+    let (k, mut gpu) = (Kernels::new(context), FrequencyNetworks::new(context, &field, &p));
+    gpu.reserve(context, n);
+    let mut packed = vec![[0.0; RAY]; 30];
+    packed.iter_mut().zip(&directions).for_each(|(ray, d)| ray[3..6].copy_from_slice(d));
+    let mut s = Samples::new(context);
+    s.len = n;
+    s.ray_of = context.upload(&(0..n as u32).map(|i| i / 10).collect::<Vec<_>>());
+    s.positions = context.upload(x.as_flattened());
+    let d_density: Vec<f32> = d_sigma.iter().zip(&sigma).map(|(d, sigma)| d * slope(*sigma)).collect();
+    let d_color: Vec<f32> = (0..8 * n)
+        .map(|i| {
+            let (s, c) = (i / 8, i % 8);
+            if c < 3 { d_rgb[3 * s + c] * rgb[s][c] * (1.0 - rgb[s][c]) } else { 0.0 }
+        })
+        .collect();
+    (gpu.d_density, gpu.d_color) = (context.upload(&d_density), context.upload(&d_color));
+    let rays = context.upload(packed.as_flattened());
+    let mut work = context.work();
+    gpu.forward(&mut work, &k, &rays, &s);
+    gpu.backward(&mut work, &k, &s);
+    gpu.step(&mut work, &k, &adam(0.0, 1));
+    work.submit();
+    agree("densities", &context.read(&gpu.sigma, n).expect("read"), &sigma, 1e-5);
+    let out: Vec<f32> = context.read(gpu.color(), 8 * n).expect("read");
+    let out: Vec<f32> =
+        out.chunks_exact(8).flat_map(|o| [o[0], o[1], o[2]].map(|z| 1.0 / (1.0 + (-z).exp()))).collect();
+    agree("colours", &out, rgb.as_flattened(), 1e-5);
+    // The first moment after one step is a tenth of the gradient.
+    let mut found = p.clone();
+    gpu.fetch(context, &mut found).expect("parameters");
+    for (found, expected) in [(&found.trunk, &p.trunk), (&found.head, &p.head)] {
+        agree("derivatives", &found.m.iter().map(|m| 10.0 * m).collect::<Vec<_>>(), &expected.grads, 1e-4);
+    }
+}
+
+#[test]
+fn a_field_of_frequencies_agrees_with_its_twin() {
+    let Some((context, _guard)) = device() else { return };
+    check_frequencies::<3>(&context, DensityActivation::Relu);
+    check_frequencies::<4>(&context, DensityActivation::Softplus);
+}
+
+#[test]
+fn a_network_with_normalised_weights_agrees_with_its_twin() {
+    let Some((context, _guard)) = device() else { return };
+    let k = Kernels::new(&context);
+    let mlp = Mlp::new(MlpShape {
+        inputs: 5,
+        width: 20,
+        hidden: 3,
+        outputs: 3,
+        activation: Activation::Relu,
+        skip: Some(Skip { layer: 2, narrow: true }),
+    });
+    let (mut rng, rows) = (rng(2, 8), 600);
+    let start = mlp.init_uniform(&mut rng);
+    let mut twin = mb_neural::network::Network::new(mlp.clone(), start, true);
+    // Lengths that are not those of the directions.
+    let [_, gains] = twin.parts_mut();
+    gains.values.iter_mut().for_each(|g| *g *= rng.random_range(0.5..2.0));
+    twin.refresh();
+    let mut network = Network::of_twin(&context, &k, &twin, false);
+    network.reserve(&context, rows);
+    for t in 1..=3 {
+        let x: Vec<f32> = (0..rows * 8).map(|i| if i % 8 < 5 { rng.random_range(-1.0..1.0) } else { 0.0 }).collect();
+        let d_out: Vec<f32> =
+            (0..rows * 8).map(|i| if i % 8 < 3 { rng.random_range(-1.0..1.0) } else { 0.0 }).collect();
+        let (mut cache, mut grads) = (MlpCache::default(), vec![0.0; mlp.buffer_len()]);
+        mlp.forward(twin.weights().parameters, &x, 8, rows, &mut cache);
+        mlp.backward(&twin.weights(), &x, 8, &mut cache, &d_out, None, &mut grads, true);
+        twin.add_gradient(&grads);
+        twin.step(&ADAM, 0.01, t);
+        let (x, d_out) = (context.upload(&x), context.upload(&d_out));
+        let mut work = context.work();
+        network.forward(&mut work, &k, &x, rows);
+        network.backward(&mut work, &k, &x, &d_out, rows);
+        network.step(&mut work, &k, &adam(0.01, t));
+        work.submit();
+        agree("outputs", &context.read(network.out(), rows * 8).expect("outputs"), &cache.out, 1e-4);
+    }
+    let mut found = twin.clone();
+    network.fetch(&context, &mut found).expect("parameters");
+    for (found, expected) in [(found.direct(), twin.direct()), (found.gains(), twin.gains())] {
+        agree("first moment", &found.m, &expected.m, 1e-4);
+        agree("second moment", &found.v, &expected.v, 1e-4);
+        agree("parameters", &found.values, &expected.values, 1e-3);
+    }
+}
+
+#[test]
 fn sums_of_a_table_hold_more_than_a_word() {
     let Some((context, _guard)) = device() else { return };
     // One level of one feature: every share goes to the same eight corners, an eighth each.
@@ -129,8 +408,18 @@ fn sums_of_a_table_hold_more_than_a_word() {
 fn networks_and_their_derivatives_agree_with_their_twins() {
     let Some((context, _guard)) = device() else { return };
     let k = Kernels::new(&context);
-    for (inputs, width, hidden, outputs) in [(32, 64, 1, 16), (5, 24, 3, 3), (16, 32, 2, 40)] {
-        let shape = MlpShape { inputs, width, hidden, outputs, activation: Activation::Relu, skip: None };
+    let skip = |layer, narrow| Some(Skip { layer, narrow });
+    let softplus = Activation::Softplus { beta: 5.0 };
+    for (inputs, width, hidden, outputs, activation, skip) in [
+        (32, 64, 1, 16, Activation::Relu, None),
+        (5, 24, 3, 3, Activation::Relu, None),
+        (16, 32, 2, 40, softplus, None),
+        (7, 24, 3, 9, Activation::Relu, skip(2, false)),
+        (7, 24, 3, 9, softplus, skip(2, true)),
+        (6, 20, 2, 3, softplus, skip(2, false)),
+        (9, 32, 2, 5, Activation::Relu, skip(1, true)),
+    ] {
+        let shape = MlpShape { inputs, width, hidden, outputs, activation, skip };
         let mlp = Mlp::new(shape);
         let mut rng = rng(hidden as u64, 1);
         let mut parameters = Parameters::new(mlp.init_uniform(&mut rng));
@@ -275,12 +564,57 @@ fn marching_agrees_with_its_twin() {
         packed.push(pack(target, 0.3, [0.0; 3], target.rgb, twin.options.near));
     }
     let o = &twin.options;
-    let space = Space { resolution: o.occupancy, far: o.far, step: o.step, cone: o.cone, inside_ball: false };
-    let (k, rays, cells) =
-        (Kernels::new(&context), context.upload(packed.as_flattened()), occupied(&context, &twin.occupancy));
-    let mut samples = Samples::new(&context);
-    samples.march(&context, &k, &space, (&rays, packed.len()), &cells).expect("samples");
-    let begins: Vec<u32> = context.read(&samples.starts, packed.len() + 1).expect("starts");
+    let space =
+        Space { resolution: o.occupancy, far: o.far, step: o.step, cone: o.cone, inside_ball: false, voxels: None };
+    let (rays, cells) = (context.upload(packed.as_flattened()), occupied(&context, &twin.occupancy));
+    agree_on_samples(&context, &space, (&rays, packed.len()), &cells, &expected);
+}
+
+#[test]
+fn marching_through_voxels_agrees_with_its_twin() {
+    let Some((context, _guard)) = device() else { return };
+    for with_masks in [true, false] {
+        let data = scene(with_masks);
+        let cameras = CameraResiduals::new(&CameraOptions::default(), &data);
+        let mut twin = Dvgo::new(DvgoOptions { step: 0.2, ..small_dvgo() }, &data);
+        // Matter in a part of space, and voxels in a part of that.
+        let cells = twin.free.resolution();
+        twin.free.values.iter_mut().enumerate().for_each(|(i, v)| *v = if i % cells < 70 { 1.0 } else { 0.0 });
+        twin.free.decide(0.5);
+        (twin.bounds.low, twin.bounds.high) = ([0.2, 0.1, 0.3], [0.9, 0.8, 0.85]);
+        let (mut targets, mut expected, mut packed) = (Vec::new(), RaySamples::<3>::default(), Vec::new());
+        data.draw(&mut rng(1, 0), 200, &cameras, &mut targets);
+        for target in &targets {
+            twin.march(&target.ray, 0.3, &mut expected);
+            let (near, far) = twin.range(&target.ray).unwrap_or((0.0, -1.0));
+            let mut ray = pack(target, 0.3, [0.0; 3], target.rgb, near);
+            [ray[14], ray[15]] = [near, far];
+            packed.push(ray);
+        }
+        let space = Space {
+            resolution: cells,
+            far: FAR,
+            step: twin.step_length(),
+            cone: 0.0,
+            inside_ball: with_masks,
+            voxels: Some(twin.bounds),
+        };
+        let rays = context.upload(packed.as_flattened());
+        agree_on_samples(&context, &space, (&rays, packed.len()), &occupied(&context, &twin.free), &expected);
+    }
+}
+
+/// Marches 200 rays, which have the twin's samples, but for a few.
+fn agree_on_samples(
+    context: &Context,
+    space: &Space,
+    (rays, count): (&Buffer, usize),
+    cells: &Buffer,
+    expected: &RaySamples<3>,
+) {
+    let mut samples = Samples::new(context);
+    samples.march(context, &Kernels::new(context), space, (rays, count), cells).expect("samples");
+    let begins: Vec<u32> = context.read(&samples.starts, count + 1).expect("starts");
     let counts: Vec<u32> = begins.windows(2).map(|w| w[1] - w[0]).collect();
     let positions: Vec<[f32; 3]> = context.read(&samples.positions, samples.len).expect("positions");
     let steps: Vec<[f32; 2]> = context.read(&samples.steps, samples.len).expect("steps");
@@ -362,7 +696,7 @@ fn compositing_and_losses_agree_with_their_twins() {
     let [rays, steps, sigmas, colors] =
         [packed.as_flattened(), distances.as_flattened(), &sigma, &color].map(|content| context.upload(content));
     let begins = context.upload(&begins);
-    let sizes = [90, scale.to_bits(), f32::to_bits(weight), DARK.to_bits()];
+    let sizes = [90, scale.to_bits(), f32::to_bits(weight), DARK.to_bits(), 0];
     let buffers = [
         (1, &rays),
         (2, &begins),
@@ -458,112 +792,20 @@ fn the_whole_field_agrees_with_its_twin() {
     assert!(!cells.is_empty() && cells.values().all(|v| sigma.contains(v) || *v > 0.0));
 }
 
-/// Losses of all steps.
-fn losses(model: &mut dyn Model, data: &RayDataset) -> Vec<f64> {
-    let mut cameras = CameraResiduals::new(&CameraOptions::default(), data);
-    (0..model.iterations()).map(|step| model.step(data, &mut cameras, step).expect("a step").loss).collect()
-}
-
-#[test]
-fn training_follows_the_twin_and_repeats_its_bytes() {
-    let Some((context, _guard)) = device() else { return };
-    let data = scene(false);
-    let mut twin = Nerf::new(small(), &data);
-    let expected = losses(&mut twin, &data);
-    let mut runs = Vec::new();
-    for _ in 0..2 {
-        let mut gpu = OnDevice(GpuNerf::new(Nerf::new(small(), &data), Arc::clone(&context)));
-        let found = losses(&mut gpu, &data);
-        gpu.fetch().expect("parameters");
-        assert!(gpu.is_finite());
-        let buffers: Vec<Vec<f32>> = gpu.buffers().into_iter().map(|b| b.clone()).collect();
-        runs.push((found, buffers));
-    }
-    assert!(runs[0] == runs[1], "two runs differ");
-    let found = &runs[0].0;
-    assert!(found[23] < 0.75 * found[0], "{found:?}");
-    for (step, (found, expected)) in found.iter().zip(&expected).enumerate() {
-        // Rounding grows as training goes on, but slowly.
-        let tolerance = if step < 8 { 1e-3 } else { 0.05 };
-        assert!((found - expected).abs() < tolerance * expected, "step {step}: {found} is not {expected}");
-    }
-}
-
-#[test]
-fn a_checkpoint_moves_between_devices_and_a_lost_device_keeps_it() {
-    let Some((context, _guard)) = device() else { return };
-    let data = scene(false);
-    let folder = tempfile::tempdir().expect("a folder");
-    let run = RunOptions {
-        checkpoint: Some(folder.path().join("state")),
-        checkpoint_every: 4,
-        report_every: 1,
-        ..RunOptions::default()
-    };
-    let mut cameras = CameraResiduals::new(&CameraOptions::default(), &data);
-    let json = serde_json::Value::Null;
-    let lost = Arc::clone(&context);
-    let stop = LoseAt { step: 6, context: lost };
-    let mut gpu = OnDevice(GpuNerf::new(Nerf::new(small(), &data), context));
-    let error = train(&mut gpu, &data, &mut cameras, &json, &run, &stop).expect_err("the device is lost").to_string();
-    assert!(error.contains("lost") && error.contains("holds the last good state"), "{error}");
-    let mut twin = Nerf::new(small(), &data);
-    let summary = train(&mut twin, &data, &mut cameras, &json, &run, &Silent).expect("the processor goes on");
-    assert_eq!((summary.first_step, summary.steps), (4, 24));
-}
-
-/// Takes the device away at a step.
-struct LoseAt {
-    step: usize,
-    context: Arc<Context>,
-}
-
-impl mb_job::Progress for LoseAt {
-    fn report(&self, _what: &str, done: usize, _total: usize) {
-        if done == self.step {
-            self.context.lose();
-        }
-    }
-
-    fn stop_requested(&self) -> bool {
-        false
-    }
-}
-
-fn small_neus() -> NeusOptions {
-    let grid = HashGridOptions { levels: 4, features: 2, log2_entries: 12, coarsest: 8, finest: 64 };
-    let mut options = NeusOptions {
-        samples_per_step: 1 << 12,
-        background: RadianceFieldOptions { grid, width: 16, color_hidden: 1 },
-        first_levels: 2,
-        longest_step: 0.1,
-        shortest_step: 0.05,
-        background_cone: 0.1,
-        far: 6.0,
-        occupancy: 32,
-        occupancy_every: 4,
-        ..NeusOptions::default()
-    }
-    .with_iterations(8);
-    options.field = SdfFieldOptions {
-        position: PositionEncoding::Hash(grid),
-        width: 16,
-        hidden: 2,
-        features: 5,
-        color_width: 16,
-        color_hidden: 1,
-        ..options.field
-    };
-    options
-}
-
 #[test]
 fn a_network_whose_gradient_a_loss_uses_agrees_with_its_twin() {
     let Some((context, _guard)) = device() else { return };
     let k = Kernels::new(&context);
-    for (inputs, width, hidden, outputs) in [(19, 32, 1, 16), (35, 24, 3, 6)] {
+    let skip = |layer, narrow| Some(Skip { layer, narrow });
+    for (inputs, width, hidden, outputs, skip) in [
+        (19, 32, 1, 16, None),
+        (35, 24, 3, 6, None),
+        (15, 36, 3, 6, skip(2, true)),
+        (7, 20, 3, 4, skip(1, false)),
+        (7, 20, 2, 1, skip(2, true)),
+    ] {
         let activation = Activation::Softplus { beta: 20.0 };
-        let mlp = Mlp::new(MlpShape { inputs, width, hidden, outputs, activation, skip: None });
+        let mlp = Mlp::new(MlpShape { inputs, width, hidden, outputs, activation, skip });
         let mut rng = rng(hidden as u64, 9);
         let parameters = Parameters::new(mlp.init_uniform(&mut rng));
         let rows = 600;
@@ -599,58 +841,25 @@ fn a_network_whose_gradient_a_loss_uses_agrees_with_its_twin() {
     }
 }
 
-/// One step changes every buffer as the twin's does. First moments are a tenth of the gradients.
-#[test]
-fn a_step_of_neus_has_the_gradients_of_its_twin() {
-    let Some((context, _guard)) = device() else { return };
-    for with_masks in [true, false] {
-        let data = scene(with_masks);
-        let mut cameras = CameraResiduals::new(&CameraOptions::default(), &data);
-        let start = || {
-            let mut twin = Neus::new(small_neus(), &data);
-            // A table that already says something, and a sharper surface.
-            let mut rng = rng(7, 0);
-            let [table, ..] = twin.field.parts_mut();
-            table.values.iter_mut().for_each(|v| *v = rng.random_range(-0.05..0.05));
-            twin.sharpness.values[0] = 0.4;
-            twin
-        };
-        let mut twin = start();
-        let mut gpu = OnDevice(GpuNeus::new(start(), Arc::clone(&context)));
-        let expected = twin.step(&data, &mut cameras, 0).expect("a step");
-        let found = gpu.step(&data, &mut cameras, 0).expect("a step");
-        gpu.fetch().expect("parameters");
-        assert!(found.rays == expected.rays && found.samples.abs_diff(expected.samples) * 1000 < expected.samples);
-        assert!((found.loss - expected.loss).abs() < 1e-3 * expected.loss, "{found:?} is not {expected:?}");
-        assert!((found.mse - expected.mse).abs() < 1e-3 * expected.mse, "{found:?} is not {expected:?}");
-        // Table, both networks with their gains, the background's three, the sharpness: values and two moments each.
-        let buffers = gpu.buffers().into_iter().zip(twin.buffers()).enumerate().take(27);
-        for (i, (found, expected)) in buffers.skip(1).step_by(3) {
-            // A sample at a cell's wall may fall on either side of it, and belongs to one ray of hundreds.
-            agree(&format!("buffer {i}, masks {with_masks}"), found, expected, 5e-3);
-        }
-    }
-}
-
-#[test]
-fn training_of_neus_follows_the_twin_and_repeats_its_bytes() {
-    let Some((context, _guard)) = device() else { return };
-    for with_masks in [true, false] {
-        let data = scene(with_masks);
-        let expected = losses(&mut Neus::new(small_neus(), &data), &data);
-        let run = || {
-            let twin = Neus::new(small_neus(), &data);
-            let mut gpu = OnDevice(GpuNeus::new(twin, Arc::clone(&context)));
-            let found = losses(&mut gpu, &data);
-            gpu.fetch().expect("parameters");
-            let buffers: Vec<Vec<f32>> = gpu.buffers().into_iter().map(|b| b.clone()).collect();
-            (found, buffers)
-        };
-        let (found, buffers) = run();
-        for (step, (found, expected)) in found.iter().zip(&expected).enumerate() {
-            let tolerance = if step < 4 { 2e-3 } else { 0.05 };
-            assert!((found - expected).abs() < tolerance * expected, "step {step}: {found} is not {expected}");
-        }
-        assert!(!with_masks || run() == (found, buffers), "two runs differ");
+/// Both stages, and two growths.
+fn small_dvgo() -> DvgoOptions {
+    let stage = |iterations, voxels: usize, start_alpha| StageOptions {
+        iterations,
+        voxels: voxels.pow(3),
+        start_alpha,
+        dim: 1e-4,
+        density_learning_rate: 0.5,
+        ..DvgoOptions::paper().coarse
+    };
+    DvgoOptions {
+        rays: 256,
+        coarse: stage(8, 20, 1e-3),
+        fine: stage(10, 24, 1e-2),
+        network: ColorNetworkOptions { channels: 5, width: 16, hidden: 2, position_octaves: 2, direction_octaves: 1 },
+        grow: vec![2, 4],
+        step: 0.7,
+        decay: 10,
+        free_space: 2e-3,
+        ..DvgoOptions::paper()
     }
 }

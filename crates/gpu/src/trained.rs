@@ -28,6 +28,20 @@ pub struct AdamStep {
     pub t: u64,
 }
 
+/// A gradient, in the form that an entry point of `adam.wgsl` reads.
+pub struct Gradient<'a> {
+    /// The entry point.
+    pub kernel: &'a Kernel,
+    /// The gradient, with its binding.
+    pub from: (u32, &'a Buffer),
+    /// Factors of the rate, each for so many numbers.
+    pub scales: Option<(&'a Buffer, u32)>,
+    /// Sums of a network's.
+    pub pieces: usize,
+    /// Unit of a table's.
+    pub unit: f32,
+}
+
 impl Trained {
     /// From their twin.
     pub fn new(context: &Context, p: &Parameters) -> Self {
@@ -46,21 +60,17 @@ impl Trained {
         Ok(())
     }
 
-    /// Records a step. `gradient` has its binding; `pieces` are the sums of a network's, `unit` is that of a table's.
-    pub fn step(
-        &self,
-        work: &mut Work<'_>,
-        kernel: &Kernel,
-        step: &AdamStep,
-        gradient: (u32, &Buffer),
-        (pieces, unit): (usize, f32),
-        threads: usize,
-    ) {
+    /// Records a step.
+    pub fn step(&self, work: &mut Work<'_>, step: &AdamStep, gradient: &Gradient<'_>, threads: usize) {
         let AdamOptions { beta1, beta2, epsilon, .. } = step.options;
         let left = |beta: f32| (1.0 - f64::from(beta).powf(step.t as f64)) as f32;
-        let floats = [beta1, beta2, step.lr / left(beta1), 1.0 / left(beta2).sqrt(), epsilon, unit].map(f32::to_bits);
-        let mut sizes = vec![self.len as u32, pieces as u32];
+        let rate = step.lr / left(beta1);
+        let floats = [beta1, beta2, rate, 1.0 / left(beta2).sqrt(), epsilon, gradient.unit].map(f32::to_bits);
+        let mut sizes = vec![self.len as u32, gradient.pieces as u32];
         sizes.extend(floats);
-        work.run(kernel, &sizes, &[(1, &self.values), (2, &self.m), (3, &self.v), gradient], threads);
+        sizes.push(gradient.scales.map_or(0, |(_, width)| width));
+        let mut buffers = vec![(1, &self.values), (2, &self.m), (3, &self.v), gradient.from];
+        buffers.extend(gradient.scales.map(|(scales, _)| (6, scales)));
+        work.run(gradient.kernel, &sizes, &buffers, threads);
     }
 }

@@ -99,6 +99,16 @@ pub struct TargetRay {
     pub mask: Option<f32>,
 }
 
+impl TargetRay {
+    /// The photograph's colour; where `only_object` and there is a mask, with this background behind the object.
+    pub fn before(&self, background: [f32; 3], only_object: bool) -> [f32; 3] {
+        match self.mask.filter(|_| only_object) {
+            Some(mask) => std::array::from_fn(|c| mask * self.rgb[c] + (1.0 - mask) * background[c]),
+            None => self.rgb,
+        }
+    }
+}
+
 impl View {
     /// Works out the camera in the scene frame.
     fn enter(&mut self, region: &Region) {

@@ -12,7 +12,7 @@
 //! Without, it is all of contracted space ([`crate::contraction`]), with steps that grow with distance, as its authors'
 //! later code has it for open scenes.
 
-use mb_job::{Result, Rng, rng};
+use mb_job::{Error, Result, Rng, rng};
 use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -124,12 +124,13 @@ impl DvgoOptions {
         }
     }
 
-    /// For a processor: fewer rays, voxels and steps, and a narrower network.
+    /// For a processor: fewer rays, voxels and steps, and a narrower network. The coarse stage starts denser: with an
+    /// opacity of 1e-6 gradients are far below Adam's epsilon for the first thousand steps or more.
     pub fn fast() -> Self {
         let paper = Self::paper();
         Self {
             rays: 2048,
-            coarse: StageOptions { iterations: 600, voxels: 64 * 64 * 64, ..paper.coarse },
+            coarse: StageOptions { iterations: 600, voxels: 64 * 64 * 64, start_alpha: 5e-4, ..paper.coarse },
             fine: StageOptions { iterations: 3_400, voxels: 144 * 144 * 144, ..paper.fine },
             network: ColorNetworkOptions { width: 64, ..paper.network },
             grow: vec![400, 800, 1200],
@@ -154,13 +155,16 @@ impl DvgoOptions {
 
 /// A box of the unit cube.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct UnitBox {
-    low: [f32; 3],
-    high: [f32; 3],
+pub struct UnitBox {
+    /// Its corner with the smallest coordinates.
+    pub low: [f32; 3],
+    /// Its corner with the largest coordinates.
+    pub high: [f32; 3],
 }
 
 impl UnitBox {
-    const ALL: Self = Self { low: [0.0; 3], high: [1.0; 3] };
+    /// All of it.
+    pub const ALL: Self = Self { low: [0.0; 3], high: [1.0; 3] };
 
     #[inline(always)]
     fn inside(&self, u: [f32; 3]) -> Option<[f32; 3]> {
@@ -200,20 +204,26 @@ struct Group {
     marched: usize,
 }
 
-/// A DVGO in training. The fields and parameters are those of the stage that it is in.
+/// A DVGO in training. The fields and parameters are those of the stage that it is in. Its state is open, for a device
+/// that trains it elsewhere.
 pub struct Dvgo {
-    options: DvgoOptions,
-    field: VoxelField,
-    parameters: VoxelParameters,
-    bounds: UnitBox,
+    /// How it is trained.
+    pub options: DvgoOptions,
+    /// Its sizes.
+    pub field: VoxelField,
+    /// What it has learned.
+    pub parameters: VoxelParameters,
+    /// The part of the unit cube that the voxels fill.
+    pub bounds: UnitBox,
     /// Where the coarse stage found something; all of the space before.
-    free: OccupancyGrid,
-    /// Share of the cameras that see each voxel of the coarse grid.
-    views: Vec<f32>,
+    pub free: OccupancyGrid,
+    /// Share of the cameras that see each voxel of the coarse grid, by which the coarse stage scales its learning rates.
+    pub views: Vec<f32>,
     /// What a checkpoint must know beside the parameters: the stage, the box, and the voxels on each side.
     layout: Vec<f32>,
     groups: Vec<Group>,
-    with_masks: bool,
+    /// Only the object, before a random background; else all of contracted space.
+    pub with_masks: bool,
 }
 
 /// Samples of a tile before the dim ones are dropped.
@@ -221,7 +231,7 @@ const TILE_SAMPLES: usize = 4096;
 /// Cells a side of the free-space grid.
 const FREE_CELLS: usize = 128;
 /// Farthest sample in radii of the region, where the space is open.
-const FAR: f32 = 64.0;
+pub const FAR: f32 = 64.0;
 
 impl Dvgo {
     /// A DVGO at its start.
@@ -269,11 +279,13 @@ impl Dvgo {
         self.layout.extend(self.field.size().map(|n| n as f32));
     }
 
-    fn is_fine(&self) -> bool {
+    /// Whether the coarse stage has ended.
+    pub fn is_fine(&self) -> bool {
         self.layout[0] > 0.0
     }
 
-    fn stage(&self) -> &StageOptions {
+    /// How the stage that it is in is trained.
+    pub fn stage(&self) -> &StageOptions {
         if self.is_fine() { &self.options.fine } else { &self.options.coarse }
     }
 
@@ -289,22 +301,29 @@ impl Dvgo {
     }
 
     /// Step in base voxels: half a voxel of the grid as it is, of the stage's final grid as the unit.
-    fn interval(&self) -> f32 {
+    pub fn interval(&self) -> f32 {
         let [nx, ny, nz] = self.field.size();
         self.options.step * (self.stage().voxels as f32 / (nx * ny * nz) as f32).cbrt()
     }
 
-    /// Adds a ray's samples to the tile; `jitter` in 0..1 shifts them by a part of a step.
-    fn march(&self, ray: &SceneRay, jitter: f32, samples: &mut RaySamples<3>) {
+    /// Step in radii of the region, where space is not contracted.
+    pub fn step_length(&self) -> f32 {
         let [nx, ny, nz] = self.field.size();
         let cube = if self.with_masks { 2.0 } else { 4.0 };
-        let h = self.options.step * cube * self.bounds.edge(nx * ny * nz);
-        let range = match self.with_masks {
-            true => ray.ball(3f32.sqrt()),
-            false => Some((0.0, FAR)),
-        };
-        if let Some((near, far)) = range {
-            let mut t = near.max(self.options.near) + jitter * h;
+        self.options.step * cube * self.bounds.edge(nx * ny * nz)
+    }
+
+    /// First and last distance of a ray's samples; `None` where it passes by.
+    pub fn range(&self, ray: &SceneRay) -> Option<(f32, f32)> {
+        let range = if self.with_masks { ray.ball(3f32.sqrt()) } else { Some((0.0, FAR)) };
+        range.map(|(near, far)| (near.max(self.options.near), far))
+    }
+
+    /// Adds a ray's samples, places in [`Self::bounds`], to the tile; `jitter` in 0..1 shifts them by a part of a step.
+    pub fn march(&self, ray: &SceneRay, jitter: f32, samples: &mut RaySamples<3>) {
+        let h = self.step_length();
+        if let Some((near, far)) = self.range(ray) {
+            let mut t = near + jitter * h;
             while t < far {
                 let p = ray.at(t);
                 let u = self.unit(p);
@@ -357,7 +376,7 @@ impl Dvgo {
         rng: &mut Rng,
         group: &mut Group,
     ) {
-        let rays = self.options.rays.div_ceil(GROUPS);
+        let rays = self.rays_of_group();
         data.draw(rng, rays, cameras, &mut group.rays);
         (group.loss, group.squared, group.marched) = (0.0, 0.0, 0);
         group.gradients.clear();
@@ -393,6 +412,11 @@ impl Dvgo {
         }
     }
 
+    /// Rays of each group of a step.
+    pub fn rays_of_group(&self) -> usize {
+        self.options.rays.div_ceil(GROUPS)
+    }
+
     /// The losses of a tile's rays and their derivatives with respect to opacities and colours.
     fn losses(&self, group: &mut Group, range: std::ops::Range<usize>, scale: f32) {
         let stage = self.stage();
@@ -404,10 +428,7 @@ impl Dvgo {
         worker.d_rgb.resize(samples, [0.0; 3]);
         for (i, (target, run)) in rays[range].iter().zip(tile.samples.ranges()).enumerate() {
             let found = &tile.composites[i];
-            let wanted = match target.mask.filter(|_| self.with_masks) {
-                Some(mask) => std::array::from_fn(|c| mask * target.rgb[c] + (1.0 - mask) * backgrounds[i][c]),
-                None => target.rgb,
-            };
+            let wanted = target.before(backgrounds[i], self.with_masks);
             let error: [f32; 3] = std::array::from_fn(|c| found.rgb[c] - wanted[c]);
             let square = error.iter().map(|e| f64::from(e * e)).sum::<f64>();
             let passed = found.transmittance.clamp(1e-6, 1.0 - 1e-6);
@@ -439,7 +460,7 @@ impl Dvgo {
     }
 
     /// Ends the coarse stage: free space, the box of what was found, and an empty fine field in it.
-    fn begin_fine(&mut self) {
+    fn begin_fine(&mut self) -> Result<()> {
         let (field, parameters, step) = (&self.field, &self.parameters, self.interval());
         let cells = FREE_CELLS;
         let mut alphas = vec![0.0; cells * cells * cells];
@@ -461,22 +482,24 @@ impl Dvgo {
                 high[d] = high[d].max((cell[d] + 1) as f32 / cells as f32);
             }
         }
-        self.bounds = if low.iter().zip(&high).all(|(a, b)| a < b) {
-            let grow = |d: usize, sign: f32| {
-                let (middle, half) = (0.5 * (low[d] + high[d]), 0.5 * (high[d] - low[d]));
-                (middle + sign * half * self.options.box_scale).clamp(0.0, 1.0)
-            };
-            UnitBox { low: std::array::from_fn(|d| grow(d, -1.0)), high: std::array::from_fn(|d| grow(d, 1.0)) }
-        } else {
-            // Nothing was found; the trainer's own checks will tell. Keep all of the space open.
-            self.free.values.fill(f32::INFINITY);
-            self.free.decide(self.options.free_space);
-            UnitBox::ALL
+        if low.iter().zip(&high).any(|(a, b)| a >= b) {
+            return Err(Error::Failed(format!(
+                "the coarse stage of dvgo found no matter in {} steps: train longer (--iterations), or check the poses with \
+                 `capture check`",
+                self.options.coarse.iterations
+            )));
+        }
+        let grow = |d: usize, sign: f32| {
+            let (middle, half) = (0.5 * (low[d] + high[d]), 0.5 * (high[d] - low[d]));
+            (middle + sign * half * self.options.box_scale).clamp(0.0, 1.0)
         };
+        self.bounds =
+            UnitBox { low: std::array::from_fn(|d| grow(d, -1.0)), high: std::array::from_fn(|d| grow(d, 1.0)) };
         let first = self.options.fine.voxels >> self.options.grow.len();
         self.field = self.fine_field(self.bounds.size(first.max(8)));
         self.parameters = self.field.init(&mut rng(self.options.seed, u64::MAX - 1));
         self.note_layout(true);
+        Ok(())
     }
 
     fn fine_field(&self, size: [usize; 3]) -> VoxelField {
@@ -491,6 +514,46 @@ impl Dvgo {
         let (field, parameters) = self.field.grown(&self.parameters, self.bounds.size(voxels));
         (self.field, self.parameters) = (field, parameters);
         self.note_layout(true);
+    }
+
+    /// Whether [`Self::begin`] replaces the field before this step.
+    pub fn is_replaced_at(&self, step: u64) -> bool {
+        step.checked_sub(self.options.coarse.iterations)
+            .is_some_and(|fine| !self.is_fine() || self.options.grow.contains(&fine))
+    }
+
+    /// What happens before a step: the fine stage begins, or its voxels double, where that is due.
+    ///
+    /// # Errors
+    /// The coarse stage found nothing.
+    pub fn begin(&mut self, step: u64) -> Result<()> {
+        if let Some(fine) = step.checked_sub(self.options.coarse.iterations) {
+            if !self.is_fine() {
+                self.begin_fine()?;
+            }
+            self.grow(fine);
+        }
+        Ok(())
+    }
+
+    /// The optimiser's number of a step, from 1, and what is left of its learning rates. It starts anew with the stage and
+    /// with each growth, and so does the decay of its rates.
+    pub fn course(&self, step: u64) -> (u64, f32) {
+        let since = match step.checked_sub(self.options.coarse.iterations) {
+            None => step,
+            Some(fine) => fine - self.options.grow.iter().copied().filter(|g| *g <= fine).max().unwrap_or(0),
+        };
+        (since + 1, 0.1f64.powf(since as f64 / self.options.decay.max(1) as f64) as f32)
+    }
+
+    /// The stage's learning rates, of which this factor is left.
+    pub fn rates(&self, factor: f32) -> VoxelRates {
+        let stage = self.stage();
+        VoxelRates {
+            density: factor * stage.density_learning_rate,
+            features: factor * stage.feature_learning_rate,
+            network: factor * stage.network_learning_rate,
+        }
     }
 
     fn final_size(&self) -> usize {
@@ -531,13 +594,7 @@ impl Model for Dvgo {
     }
 
     fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
-        let coarse = self.options.coarse.iterations;
-        if step >= coarse {
-            if !self.is_fine() {
-                self.begin_fine();
-            }
-            self.grow(step - coarse);
-        }
+        self.begin(step)?;
         let transposed = self.field.transpose(&self.parameters);
         let move_cameras = cameras.wants_gradients(step);
         let mut groups = std::mem::take(&mut self.groups);
@@ -546,24 +603,13 @@ impl Model for Dvgo {
             self.run_group(data, cameras, move_cameras, &transposed, &mut rng, group);
         });
         self.field.collect(&mut self.parameters, groups.iter_mut().map(|g| &mut g.field));
-        // The optimiser starts anew with the stage and with each growth, and so does the decay of its rates.
-        let since = match step.checked_sub(coarse) {
-            None => step,
-            Some(fine) => fine - self.options.grow.iter().copied().filter(|g| *g <= fine).max().unwrap_or(0),
-        };
-        let factor = 0.1f64.powf(since as f64 / self.options.decay.max(1) as f64) as f32;
+        let (t, factor) = self.course(step);
         if move_cameras {
             cameras.add(data, groups.iter().flat_map(|g| g.rays.iter().zip(&g.gradients)));
             cameras.step(data, factor, step);
         }
-        let stage = self.stage();
-        let rates = VoxelRates {
-            density: factor * stage.density_learning_rate,
-            features: factor * stage.feature_learning_rate,
-            network: factor * stage.network_learning_rate,
-        };
         let scales = (!self.is_fine()).then_some(self.views.as_slice());
-        self.parameters.step(rates, scales, since + 1);
+        self.parameters.step(self.rates(factor), scales, t);
         let rays = groups.iter().map(|g| g.rays.len()).sum::<usize>();
         let report = StepReport {
             loss: groups.iter().map(|g| g.loss).sum::<f64>() / rays as f64,

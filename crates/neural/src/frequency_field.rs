@@ -60,18 +60,25 @@ impl FrequencyFieldOptions {
 /// The field's sizes, worked out, for positions of D coordinates.
 #[derive(Debug, Clone)]
 pub struct FrequencyField<const D: usize> {
-    position: Frequencies,
-    direction: Frequencies,
-    trunk: Mlp,
-    head: Mlp,
-    activation: DensityActivation,
+    /// Octaves of the position.
+    pub position: Frequencies,
+    /// Octaves of the direction.
+    pub direction: Frequencies,
+    /// From frequencies of the position to a number and features.
+    pub trunk: Mlp,
+    /// From features and frequencies of the direction to a colour, before the sigmoid.
+    pub head: Mlp,
+    /// From the trunk's number to density.
+    pub activation: DensityActivation,
 }
 
 /// The field's parameters.
 #[derive(Debug, Clone)]
 pub struct FrequencyParameters {
-    trunk: Parameters,
-    head: Parameters,
+    /// The trunk's.
+    pub trunk: Parameters,
+    /// The head's.
+    pub head: Parameters,
 }
 
 /// Transposed weights of both networks, made once a step.

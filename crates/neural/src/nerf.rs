@@ -274,10 +274,7 @@ impl Nerf {
         let samples = &tile.samples;
         let (mut places, mut lengths) = (Vec::new(), Vec::new());
         for (i, (target, run)) in rays[range].iter().zip(samples.ranges()).enumerate() {
-            let wanted = match target.mask.filter(|_| self.options.object_only) {
-                Some(mask) => std::array::from_fn(|c| mask * target.rgb[c] + (1.0 - mask) * backgrounds[i][c]),
-                None => target.rgb,
-            };
+            let wanted = target.before(backgrounds[i], self.options.object_only);
             let error: [f32; 3] = std::array::from_fn(|c| tile.composites[i].rgb[c] - wanted[c]);
             *loss += error.iter().map(|e| f64::from(e * e)).sum::<f64>();
             let d_weights = &mut worker.d_sigma[run.clone()];

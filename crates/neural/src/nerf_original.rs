@@ -109,20 +109,25 @@ struct Group {
     squared: f64,
 }
 
-/// An original NeRF in training.
+/// An original NeRF in training. Its state is open, for a device that trains it elsewhere.
 pub struct NerfOriginal {
-    options: NerfOriginalOptions,
-    field: FrequencyField<3>,
-    coarse: FrequencyParameters,
-    fine: FrequencyParameters,
+    /// How it is trained.
+    pub options: NerfOriginalOptions,
+    /// The sizes of both networks.
+    pub field: FrequencyField<3>,
+    /// What the coarse network has learned.
+    pub coarse: FrequencyParameters,
+    /// What the fine network has learned.
+    pub fine: FrequencyParameters,
     groups: Vec<Group>,
-    with_masks: bool,
+    /// Only the object, before a random background; else all of contracted space.
+    pub with_masks: bool,
 }
 
-/// Rays that go through the networks at once.
-const TILE_RAYS: usize = 8;
-/// The authors' code; the paper has 1e-7 for the last.
-const ADAM: AdamOptions = AdamOptions { beta1: 0.9, beta2: 0.999, epsilon: 1e-8, skip_untouched: false };
+/// Rays that go through the networks at once, and draw their random numbers together.
+pub const TILE_RAYS: usize = 8;
+/// Adam's constants: the authors' code; the paper has 1e-7 for the last.
+pub const ADAM: AdamOptions = AdamOptions { beta1: 0.9, beta2: 0.999, epsilon: 1e-8, skip_untouched: false };
 
 impl NerfOriginal {
     /// A NeRF at its start.
@@ -139,13 +144,18 @@ impl NerfOriginal {
         }
     }
 
+    /// Rays of each group of a step.
+    pub fn rays_of_group(&self) -> usize {
+        self.options.rays.div_ceil(GROUPS)
+    }
+
     /// What the networks see of a scene point.
     fn seen(&self, p: [f32; 3]) -> [f32; 3] {
         if self.with_masks { p } else { contract(p).map(|c| 4.0 * c - 2.0) }
     }
 
     /// First and last distance of a ray's samples; a ray that misses the ball has none of it.
-    fn range(&self, ray: &SceneRay) -> (f32, f32) {
+    pub fn range(&self, ray: &SceneRay) -> (f32, f32) {
         match self.with_masks {
             true => ray.ball(1.0).map_or((0.0, 0.0), |(near, far)| (near.max(0.05), far.max(0.06))),
             false => (self.options.near, self.options.far),
@@ -153,7 +163,7 @@ impl NerfOriginal {
     }
 
     /// Distances of the coarse samples: even in distance, or in its inverse.
-    fn coarse_depths(&self, ray: &SceneRay, rng: Option<&mut Rng>) -> Vec<f32> {
+    pub fn coarse_depths(&self, ray: &SceneRay, rng: Option<&mut Rng>) -> Vec<f32> {
         let (near, far) = self.range(ray);
         let mut depths = Vec::new();
         if self.with_masks {
@@ -240,7 +250,7 @@ impl NerfOriginal {
         rng: &mut Rng,
         group: &mut Group,
     ) {
-        let rays = self.options.rays.div_ceil(GROUPS);
+        let rays = self.rays_of_group();
         data.draw(rng, rays, cameras, &mut group.rays);
         (group.loss, group.squared) = (0.0, 0.0);
         group.gradients.clear();
@@ -292,10 +302,7 @@ impl NerfOriginal {
         let mut sum = 0.0;
         for (i, target) in targets.iter().enumerate() {
             let run = i * n..(i + 1) * n;
-            let wanted = match target.mask.filter(|_| self.with_masks) {
-                Some(mask) => std::array::from_fn(|c| mask * target.rgb[c] + (1.0 - mask) * backgrounds[i][c]),
-                None => target.rgb,
-            };
+            let wanted = target.before(backgrounds[i], self.with_masks);
             let error: [f32; 3] = std::array::from_fn(|c| samples.composites[i].rgb[c] - wanted[c]);
             sum += error.iter().map(|e| f64::from(e * e)).sum::<f64>();
             composite_backward(

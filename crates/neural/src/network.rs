@@ -48,9 +48,14 @@ impl Network {
         &self.direct
     }
 
-    /// The same, to be replaced; call [`Self::refresh`] afterwards.
-    pub fn direct_mut(&mut self) -> &mut Parameters {
-        &mut self.direct
+    /// Lengths of the weights, layer after layer; empty where they are not normalised.
+    pub fn gains(&self) -> &Parameters {
+        &self.gains
+    }
+
+    /// [`Self::direct`] and [`Self::gains`], to be replaced; call [`Self::refresh`] afterwards.
+    pub fn parts_mut(&mut self) -> [&mut Parameters; 2] {
+        [&mut self.direct, &mut self.gains]
     }
 
     /// Number of parameters, lengths of weight normalisation included as PyTorch counts them, padding not.

@@ -140,24 +140,29 @@ struct Group {
     d_sharpness: f32,
 }
 
-/// An original NeuS in training.
+/// An original NeuS in training. Its state is open, for a device that trains it elsewhere.
 pub struct NeusOriginal {
-    options: NeusOriginalOptions,
-    field: SdfField,
-    outside: FrequencyField<4>,
-    outside_parameters: FrequencyParameters,
+    /// How it is trained.
+    pub options: NeusOriginalOptions,
+    /// The surface.
+    pub field: SdfField,
+    /// The sizes of the background.
+    pub outside: FrequencyField<4>,
+    /// What the background has learned.
+    pub outside_parameters: FrequencyParameters,
     /// v, with sharpness s = exp(10 v).
     sharpness: Parameters,
     groups: Vec<Group>,
-    with_masks: bool,
+    /// Only the object, before black; else with a background.
+    pub with_masks: bool,
 }
 
-/// Rays that go through the networks at once.
-const TILE_RAYS: usize = 4;
+/// Rays that go through the networks at once, and share the eikonal loss.
+pub const TILE_RAYS: usize = 4;
 /// Reach of the eikonal loss around the centre, in radii (the authors' code).
-const RELAXED: f32 = 1.2;
-/// PyTorch's constants.
-const ADAM: AdamOptions = AdamOptions { beta1: 0.9, beta2: 0.999, epsilon: 1e-8, skip_untouched: false };
+pub const RELAXED: f32 = 1.2;
+/// Adam's constants, PyTorch's.
+pub const ADAM: AdamOptions = AdamOptions { beta1: 0.9, beta2: 0.999, epsilon: 1e-8, skip_untouched: false };
 
 impl NeusOriginal {
     /// A NeuS at its start.
@@ -176,26 +181,61 @@ impl NeusOriginal {
         }
     }
 
-    fn sharpness(&self) -> f32 {
+    /// s.
+    pub fn sharpness(&self) -> f32 {
         (10.0 * self.sharpness.values[0]).exp().clamp(1e-6, 1e6)
     }
 
-    fn anneal(&self, step: u64) -> f32 {
+    /// How far rays must face the surface, 0 to 1.
+    pub fn anneal(&self, step: u64) -> f32 {
         // The authors anneal only without masks.
         let over = if self.with_masks { 0 } else { self.options.anneal };
         if over == 0 { 1.0 } else { (step as f32 / over as f32).min(1.0) }
     }
 
+    /// Adam step number `t` of the sharpness, given the loss's derivative by s.
+    pub fn step_sharpness(&mut self, d_sharpness: f32, lr: f32, t: u64) {
+        // ds/dv = 10 s.
+        self.sharpness.grads[0] = d_sharpness * 10.0 * self.sharpness();
+        self.sharpness.step(&ADAM, lr, t);
+    }
+
+    /// Rays of each group of a step.
+    pub fn rays_of_group(&self) -> usize {
+        self.options.rays.div_ceil(GROUPS)
+    }
+
+    /// Even starts of a ray's sections around its point nearest to the centre.
+    pub fn even_depths(&self, ray: &SceneRay, rng: Option<&mut Rng>) -> Vec<f32> {
+        let n = self.options.samples;
+        let shift = rng.map_or(0.0, |rng| (rng.random::<f32>() - 0.5) * 2.0 / n as f32);
+        let even = |i: usize| middle(ray) - 1.0 + 2.0 * i as f32 / (n - 1).max(1) as f32 + shift;
+        (0..n).map(even).collect()
+    }
+
+    /// Starts of a ray's sections behind the ball: even in inverse distance, ascending in distance, each shifted inside the
+    /// half-way marks to its neighbours. None with masks.
+    pub fn outside_depths(&self, ray: &SceneRay, mut rng: Option<&mut Rng>) -> Vec<f32> {
+        let n = if self.with_masks { 0 } else { self.options.outside };
+        let even = |i: f32| 1e-3 + (1.0 - 1.0 / (n as f32 + 1.0) - 1e-3) * i / n.saturating_sub(1).max(1) as f32;
+        let shifted = (0..n).rev().map(|i| {
+            let (low, high) = (even((i as f32 - 0.5).max(0.0)), even((i as f32 + 0.5).min((n - 1) as f32)));
+            let u = match rng.as_mut() {
+                Some(rng) => low + (high - low) * rng.random::<f32>(),
+                None => even(i as f32),
+            };
+            (middle(ray) + 1.0) / u + 1.0 / self.options.samples as f32
+        });
+        shifted.collect()
+    }
+
     /// Ascending starts of a ray's sections: even ones, then the rounds.
-    fn depths(&self, ray: &SceneRay, mut rng: Option<&mut Rng>, probe: &mut SdfWorker) -> Vec<f32> {
+    pub fn depths(&self, ray: &SceneRay, rng: Option<&mut Rng>, probe: &mut SdfWorker) -> Vec<f32> {
         let o = &self.options;
-        let middle = -(0..3).map(|d| ray.origin[d] * ray.direction[d]).sum::<f32>();
-        let shift = rng.as_mut().map_or(0.0, |rng| (rng.random::<f32>() - 0.5) * 2.0 / o.samples as f32);
-        let even = |i: usize| middle - 1.0 + 2.0 * i as f32 / (o.samples - 1).max(1) as f32 + shift;
-        let mut depths: Vec<f32> = (0..o.samples).map(even).collect();
+        let mut depths = self.even_depths(ray, rng);
         let mut sdf = self.probed(ray, &depths, probe);
         for round in 0..o.rounds {
-            let weights = round_weights(ray, &depths, &sdf, 64.0 * (1u32 << round) as f32);
+            let weights = round_weights(ray, &depths, &sdf, round_sharpness(round));
             let mut more = Vec::new();
             importance(&depths, &weights, o.importance / o.rounds, None, &mut more);
             let found = if round + 1 < o.rounds { self.probed(ray, &more, probe) } else { vec![0.0; more.len()] };
@@ -219,20 +259,7 @@ impl NeusOriginal {
         let mut starts = self.depths(ray, rng.as_deref_mut(), probe);
         let last = 2.0 / o.samples as f32;
         let inner_sections = starts.len();
-        if !self.with_masks {
-            let middle = -(0..3).map(|d| ray.origin[d] * ray.direction[d]).sum::<f32>();
-            let n = o.outside;
-            let even = |i: f32| 1e-3 + (1.0 - 1.0 / (n as f32 + 1.0) - 1e-3) * i / (n - 1).max(1) as f32;
-            // Ascending in distance, each shifted inside the half-way marks to its neighbours.
-            for i in (0..n).rev() {
-                let (low, high) = (even((i as f32 - 0.5).max(0.0)), even((i as f32 + 0.5).min((n - 1) as f32)));
-                let u = match rng.as_mut() {
-                    Some(rng) => low + (high - low) * rng.random::<f32>(),
-                    None => even(i as f32),
-                };
-                starts.push((middle + 1.0) / u + 1.0 / o.samples as f32);
-            }
-        }
+        starts.extend(self.outside_depths(ray, rng));
         for (i, start) in starts.iter().enumerate() {
             let dt = starts.get(i + 1).map_or(last, |next| next - start);
             let t = start + 0.5 * dt;
@@ -298,7 +325,7 @@ impl NeusOriginal {
         rng: &mut Rng,
         group: &mut Group,
     ) {
-        let rays = self.options.rays.div_ceil(GROUPS);
+        let rays = self.rays_of_group();
         let anneal = self.anneal(step);
         data.draw(rng, rays, cameras, &mut group.rays);
         (group.loss, group.squared, group.samples, group.d_sharpness) = (0.0, 0.0, 0, 0.0);
@@ -407,6 +434,16 @@ impl NeusOriginal {
     }
 }
 
+/// Distance of the ray's point that is nearest to the centre.
+fn middle(ray: &SceneRay) -> f32 {
+    -(0..3).map(|d| ray.origin[d] * ray.direction[d]).sum::<f32>()
+}
+
+/// The sharpness that a round assumes: 64, and twice that of the round before.
+pub fn round_sharpness(round: usize) -> f32 {
+    64.0 * (1u32 << round) as f32
+}
+
 /// Weights of the sections between neighbouring samples under a logistic density of this sharpness, from the samples'
 /// distances alone (the authors' `up_sample`): the slope of a section is the steeper of its own and the one before, never
 /// upwards, and zero outside the ball.
@@ -463,8 +500,6 @@ impl Model for NeusOriginal {
         });
         self.field.collect(groups.iter_mut().map(|g| &mut g.sdf));
         self.outside.collect(&mut self.outside_parameters, groups.iter_mut().map(|g| &mut g.outside));
-        // ds/dv = 10 s.
-        self.sharpness.grads[0] = groups.iter().map(|g| g.d_sharpness).sum::<f32>() * 10.0 * self.sharpness();
         let factor = self.options.schedule.factor(step);
         if cameras.wants_gradients(step) {
             cameras.add(data, groups.iter().flat_map(|g| g.rays.iter().zip(&g.gradients)));
@@ -472,7 +507,7 @@ impl Model for NeusOriginal {
         }
         let lr = self.options.learning_rate * factor;
         self.field.step(&ADAM, lr, lr, step + 1);
-        self.sharpness.step(&ADAM, lr, step + 1);
+        self.step_sharpness(groups.iter().map(|g| g.d_sharpness).sum(), lr, step + 1);
         if !self.with_masks {
             self.outside_parameters.step(&ADAM, lr, step + 1);
         }

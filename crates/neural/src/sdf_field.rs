@@ -68,14 +68,6 @@ pub struct SdfFieldOptions {
 }
 
 impl SdfFieldOptions {
-    /// Whether the field is a hash grid, harmonics and two plain networks: without skip layer and weight normalisation.
-    pub fn is_plain(&self) -> bool {
-        matches!(self.position, PositionEncoding::Hash(_))
-            && self.direction == DirectionEncoding::Harmonics
-            && self.skip.is_none()
-            && !self.weight_norm
-    }
-
     /// The networks of the paper (Wang et al. 2021 and its code, `confs/wmask.conf`): distance 8 x 256 with softplus of
     /// sharpness 100, skip at layer 4, 6 octaves, 256 features; colour 4 x 256 with 4 octaves of the direction; both
     /// with normalised weights; a ball of radius 0.5 at the start.
@@ -110,17 +102,19 @@ pub struct SdfField {
     pub active_levels: usize,
 }
 
-/// What a field on a hash grid is made of.
+/// What a field is made of, for a twin on a device.
 #[derive(Debug, Clone, Copy)]
 pub struct SdfParts<'a> {
-    /// Encoding of the position.
-    pub grid: &'a HashGrid,
-    /// Its table.
-    pub table: &'a Parameters,
+    /// Hash encoding of the position, and its table; `None` where the position has frequencies.
+    pub grid: Option<(&'a HashGrid, &'a Parameters)>,
+    /// Octaves of the position, where there is no hash encoding.
+    pub frequencies: Frequencies,
+    /// Encoding of the direction.
+    pub direction: DirectionEncoding,
     /// Distance and features.
-    pub geometry: (&'a Mlp, &'a Parameters),
+    pub geometry: &'a Network,
     /// Colour.
-    pub color: (&'a Mlp, &'a Parameters),
+    pub color: &'a Network,
 }
 
 /// Buffers for one worker: a tile in flight, and the gradients gathered since the last [`SdfField::collect`].
@@ -205,21 +199,20 @@ impl SdfField {
         }
     }
 
-    /// The hash grid, the geometry network and the colour network, each with its parameters; `None` where the
-    /// field [is not plain](SdfFieldOptions::is_plain).
-    pub fn parts(&self) -> Option<SdfParts<'_>> {
-        let grid = self.grid.as_ref().filter(|_| self.options.is_plain())?;
-        Some(SdfParts {
-            grid,
-            table: &self.table,
-            geometry: (self.geometry.mlp(), self.geometry.direct()),
-            color: (self.color.mlp(), self.color.direct()),
-        })
+    /// What it is made of.
+    pub fn parts(&self) -> SdfParts<'_> {
+        SdfParts {
+            grid: self.grid.as_ref().map(|grid| (grid, &self.table)),
+            frequencies: self.frequencies,
+            direction: self.options.direction,
+            geometry: &self.geometry,
+            color: &self.color,
+        }
     }
 
-    /// The parameters of [`Self::parts`] in their order, to be replaced; call [`Self::refresh`] afterwards.
-    pub fn parts_mut(&mut self) -> [&mut Parameters; 3] {
-        [&mut self.table, self.geometry.direct_mut(), self.color.direct_mut()]
+    /// The table, the geometry network and the colour network, to be replaced; call [`Self::refresh`] afterwards.
+    pub fn parts_mut(&mut self) -> (&mut Parameters, [&mut Network; 2]) {
+        (&mut self.table, [&mut self.geometry, &mut self.color])
     }
 
     /// Number of parameters, padding not counted.

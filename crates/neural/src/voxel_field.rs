@@ -45,6 +45,19 @@ pub struct VoxelField {
     shift: f32,
 }
 
+/// The field's parts, for a twin on a device.
+#[derive(Debug, Clone, Copy)]
+pub struct VoxelParts<'a> {
+    /// Grid of raw densities.
+    pub density: &'a DenseGrid,
+    /// Grid of colours (before the sigmoid) or features.
+    pub features: &'a DenseGrid,
+    /// The colour network, which takes the features, frequencies of the position (in -1..1) and of the direction.
+    pub network: Option<(&'a Mlp, Frequencies, Frequencies)>,
+    /// b.
+    pub shift: f32,
+}
+
 /// The field's parameters.
 #[derive(Debug, Clone, Default)]
 pub struct VoxelParameters {
@@ -116,6 +129,12 @@ impl VoxelField {
             network,
             shift: ((1.0 - f64::from(start_alpha)).powf(-1.0 / f64::from(start_step)) - 1.0).ln() as f32,
         }
+    }
+
+    /// What it is made of.
+    pub fn parts(&self) -> VoxelParts<'_> {
+        let network = self.network.as_ref().map(|(mlp, position, direction)| (mlp, *position, *direction));
+        VoxelParts { density: &self.density, features: &self.features, network, shift: self.shift }
     }
 
     /// Voxels along x, y and z.
@@ -326,16 +345,18 @@ impl VoxelField {
     }
 }
 
+/// Adam's constants (DVGO: beta2 = 0.99).
+pub const ADAM: AdamOptions = AdamOptions { beta1: 0.9, beta2: 0.99, epsilon: 1e-8, skip_untouched: false };
+
 impl VoxelParameters {
-    /// One Adam step, number `t` from 1 (DVGO: beta2 = 0.99). Voxels that no sample touched keep their value. With
+    /// One Adam step, number `t` from 1. Voxels that no sample touched keep their value. With
     /// `per_voxel`, the density's and the features' rates are scaled voxel by voxel.
     pub fn step(&mut self, rates: VoxelRates, per_voxel: Option<&[f32]>, t: u64) {
-        let options = AdamOptions { beta2: 0.99, ..AdamOptions::default() };
-        let grids = AdamOptions { skip_untouched: true, ..options };
+        let grids = AdamOptions { skip_untouched: true, ..ADAM };
         self.density.step_scaled(&grids, rates.density, t, per_voxel.map(|s| (s, 1)));
         let channels = self.features.values.len() / self.density.values.len().max(1);
         self.features.step_scaled(&grids, rates.features, t, per_voxel.map(|s| (s, channels)));
-        self.network.step(&options, rates.network, t);
+        self.network.step(&ADAM, rates.network, t);
     }
 
     /// All buffers that a checkpoint holds.

@@ -165,6 +165,42 @@ fn a_box_comes_back_within_one_percent_of_its_size() {
     }
 }
 
+/// The coarse stage must find the ball, or the fine one would search all of space.
+#[test]
+fn dvgo_finds_a_sphere_and_skips_the_space_around_it() {
+    let data = RayDataset::from_images(photographs(20, ball(0.06)), 0).expect("20 good views");
+    let mut options = DvgoOptions { rays: 1024, grow: vec![50, 100], ..DvgoOptions::fast() };
+    (options.coarse.voxels, options.coarse.iterations) = (40 * 40 * 40, 250);
+    (options.fine.voxels, options.fine.iterations) = (56 * 56 * 56, 350);
+    let json = serde_json::to_value(&options).expect("plain data");
+    let mut dvgo = Dvgo::new(options, &data);
+    let run_options = RunOptions { report_every: 50, ..RunOptions::default() };
+    let summary = run(&mut dvgo, &data, &json, &run_options, &Silent).expect("it converges");
+    let (coarse, fine) = (&summary.curve[4], &summary.curve[11]);
+    assert!(coarse.psnr_db > 25.0 && fine.psnr_db > 28.0, "{} and {} dB", coarse.psnr_db, fine.psnr_db);
+    assert!(fine.samples_per_ray < 0.5 * coarse.samples_per_ray, "{} samples a ray", fine.samples_per_ray);
+
+    let cameras = CameraResiduals::new(&CameraOptions::default(), &data);
+    let mesh =
+        extract(&dvgo, &data, &cameras, &SurfaceOptions { voxel_mm: 2.0, cull: true }, &Silent).expect("a surface");
+    // No photograph says anything of the inside, which stays hollow: its wall faces inwards.
+    let outer = mesh.vertices.iter().zip(mesh.vertex_normals()).map(|(v, normal)| (v.coords - CENTER, normal));
+    let radii: Vec<f64> = outer.filter(|(p, normal)| p.dot(normal) > 0.0).map(|(p, _)| p.norm()).collect();
+    let mean = radii.iter().sum::<f64>() / radii.len() as f64;
+    assert!((mean / 0.06 - 1.0).abs() < 0.02, "radius {mean} of {} vertices", radii.len());
+}
+
+#[test]
+fn a_coarse_stage_that_finds_nothing_is_told() {
+    let data = RayDataset::from_images(photographs(4, ball(0.06)), 0).expect("4 views");
+    let mut options = small_dvgo();
+    (options.coarse.start_alpha, options.free_space) = (1e-6, 1e-3);
+    let json = serde_json::to_value(&options).expect("plain data");
+    let mut dvgo = Dvgo::new(options, &data);
+    let error = run(&mut dvgo, &data, &json, &RunOptions::default(), &Silent).expect_err("five steps find nothing");
+    assert!(error.to_string().contains("found no matter in 5 steps"), "{error}");
+}
+
 /// Stops after so many steps.
 struct StopAt(usize);
 
@@ -188,8 +224,9 @@ fn small_nerf() -> NerfOptions {
     options.with_iterations(12)
 }
 
+/// Its few coarse steps add little to the grid of zeros, so free space is what has even less.
 fn small_dvgo() -> DvgoOptions {
-    let mut options = DvgoOptions { rays: 256, ..DvgoOptions::fast() };
+    let mut options = DvgoOptions { rays: 256, free_space: 1e-5, ..DvgoOptions::fast() };
     options.coarse.voxels = 16 * 16 * 16;
     options.fine.voxels = 24 * 24 * 24;
     options.network.width = 16;

@@ -11,8 +11,10 @@ struct Sizes {
     // 1 / sqrt(1 - beta2^t).
     correction: f32,
     epsilon: f32,
-    // `table`: one unit of the sums.
+    // Tables: one unit of the sums.
     unit: f32,
+    // `scaled`: numbers of an entry, which have one factor.
+    width: u32,
 }
 
 @group(0) @binding(0) var<uniform> sizes: Sizes;
@@ -21,15 +23,17 @@ struct Sizes {
 @group(0) @binding(3) var<storage, read_write> v: array<f32>;
 // Gradient as whole numbers of 64 bits, low word first; cleared.
 @group(0) @binding(4) var<storage, read_write> sums: array<vec2<u32>>;
-// [pieces, parameters]
-@group(0) @binding(5) var<storage, read> partial_sums: array<f32>;
+// [pieces, parameters]; cleared.
+@group(0) @binding(5) var<storage, read_write> partial_sums: array<f32>;
+// [entries]: factors of the rate.
+@group(0) @binding(6) var<storage, read> scales: array<f32>;
 
-fn update(i: u32, g: f32) {
+fn update(i: u32, g: f32, rate: f32) {
     let m_new = sizes.beta1 * m[i] + (1.0 - sizes.beta1) * g;
     let v_new = sizes.beta2 * v[i] + (1.0 - sizes.beta2) * g * g;
     m[i] = m_new;
     v[i] = v_new;
-    values[i] -= sizes.rate * m_new / (sqrt(v_new) * sizes.correction + sizes.epsilon);
+    values[i] -= rate * m_new / (sqrt(v_new) * sizes.correction + sizes.epsilon);
 }
 
 // The number of 64 bits, by its size and sign, so that nothing cancels.
@@ -42,21 +46,42 @@ fn real(sum: vec2<u32>) -> f32 {
     return -(f32(high) * 4294967296.0 + f32(low));
 }
 
+fn is_touched(first: u32, last: u32) -> bool {
+    var bits = 0u;
+    for (var i = first; i < last; i += 1u) {
+        bits |= sums[i].x | sums[i].y;
+    }
+    return bits != 0u;
+}
+
+// A parameter's derivative, which is cleared.
+fn take(i: u32) -> f32 {
+    let g = real(sums[i]) * sizes.unit;
+    sums[i] = vec2(0u);
+    return g;
+}
+
 // One thread for a run of sixteen parameters: runs that no sample touched keep their values and moments.
 @compute @workgroup_size(64)
 fn table(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     let first = (id.y * groups.x * 64u + id.x) * 16u;
     let last = min(first + 16u, sizes.parameters);
-    var bits = 0u;
-    for (var i = first; i < last; i += 1u) {
-        bits |= sums[i].x | sums[i].y;
+    if is_touched(first, last) {
+        for (var i = first; i < last; i += 1u) {
+            update(i, take(i), sizes.rate);
+        }
     }
-    if bits == 0u {
-        return;
-    }
-    for (var i = first; i < last; i += 1u) {
-        update(i, real(sums[i]) * sizes.unit);
-        sums[i] = vec2(0u);
+}
+
+// The same where each entry has a factor.
+@compute @workgroup_size(64)
+fn scaled(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let first = (id.y * groups.x * 64u + id.x) * 16u;
+    let last = min(first + 16u, sizes.parameters);
+    if is_touched(first, last) {
+        for (var i = first; i < last; i += 1u) {
+            update(i, take(i), sizes.rate * scales[i / sizes.width]);
+        }
     }
 }
 
@@ -69,7 +94,9 @@ fn network(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups
     }
     var g = 0.0;
     for (var piece = 0u; piece < sizes.pieces; piece += 1u) {
-        g += partial_sums[piece * sizes.parameters + i];
+        let at = piece * sizes.parameters + i;
+        g += partial_sums[at];
+        partial_sums[at] = 0.0;
     }
-    update(i, g);
+    update(i, g, sizes.rate);
 }

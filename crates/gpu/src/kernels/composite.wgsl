@@ -9,6 +9,8 @@ struct Sizes {
     distortion: f32,
     // Light below which the rest of a ray is dropped.
     dark: f32,
+    // How the density network's output 0, o, gives density: 0 exp(o), 1 max(o, 0), 2 ln(1 + exp(o)).
+    activation: u32,
 }
 
 @group(0) @binding(0) var<uniform> sizes: Sizes;
@@ -35,6 +37,17 @@ struct Sizes {
 fn opacity(i: u32) -> f32 {
     let x = sigma[i] * steps[i].y;
     return select(1.0 - exp(-x), x * (1.0 - x * (0.5 - x / 6.0)), x < 0.01);
+}
+
+// d sigma / d o.
+fn slope(sigma: f32) -> f32 {
+    if sizes.activation == 1u {
+        return select(0.0, 1.0, sigma > 0.0);
+    }
+    if sizes.activation == 2u {
+        return select(1.0 - exp(-sigma), sigma * (1.0 - 0.5 * sigma), sigma < 1e-3);
+    }
+    return sigma;
 }
 
 fn rgb_of(i: u32) -> vec3<f32> {
@@ -99,8 +112,8 @@ fn losses_of_rays(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_wor
         let q = dot(d, rgb) + d_density[k];
         let d_alpha = d_color[8u * k] * (q - behind);
         behind = alpha * q + (1.0 - alpha) * behind;
-        // d alpha / d sigma = dt (1 - alpha), d sigma / d o = sigma.
-        d_density[k] = d_alpha * steps[k].y * (1.0 - alpha) * sigma[k];
+        // d alpha / d sigma = dt (1 - alpha).
+        d_density[k] = d_alpha * steps[k].y * (1.0 - alpha) * slope(sigma[k]);
         let d_rgb = d * weights[k] * rgb * (1.0 - rgb);
         d_color[8u * k] = d_rgb.x;
         d_color[8u * k + 1u] = d_rgb.y;

@@ -1,8 +1,8 @@
 // One layer of a network, h = act(x W + b), and its derivatives, as one matrix product C = A B in tiles of 32 x 32. Twins:
 // `simd::gemm`, `Mlp::forward` and `Mlp::backward`; `mlp.rs` has the formulas.
 
-// 0: h = act(x W + b), for tangents u = q W. 1: dx = (dz W^T) act'. 2: dW = x^T dz and db = 1^T dz, in pieces of the rows;
-// tangents add dW = q^T r to the pieces.
+// 0: h = act(x W + b), for tangents u = q W. 1: dx = (dz W^T) act'. 2: dW = x^T dz and db = 1^T dz, of tangents dW = q^T r,
+// added to sums over pieces of the rows.
 override product: u32;
 
 struct Sizes {
@@ -10,8 +10,8 @@ struct Sizes {
     inputs: u32,
     in_stride: u32,
     outputs: u32,
-    out_stride: u32,
-    // Where the layer's weights begin, [inputs, out_stride], followed by the bias, [out_stride].
+    weight_stride: u32,
+    // Where the layer's weights begin, [inputs, weight_stride], followed by the bias, [weight_stride].
     weights: u32,
     // What z goes through in product 0, and what x came from in product 1: 0 nothing, 1 ReLU, 2 softplus.
     activation: u32,
@@ -24,6 +24,12 @@ struct Sizes {
     tangent: u32,
     // Product 2: dz is the unit vector of output 0.
     unit: u32,
+    out_stride: u32,
+    // Inputs that the layer before gives, behind which a skip layer has the network's, and the scale of both.
+    own: u32,
+    in_scale: f32,
+    // Product 0: what h is scaled by.
+    out_scale: f32,
 }
 
 @group(0) @binding(0) var<uniform> sizes: Sizes;
@@ -62,15 +68,16 @@ fn left(m: u32, k: u32) -> f32 {
 // B[k, n].
 fn right(k: u32, n: u32) -> f32 {
     if product == 0u {
-        return parameters[sizes.weights + k * sizes.out_stride + n];
+        return parameters[sizes.weights + k * sizes.weight_stride + n];
     }
     if product == 1u {
-        return parameters[sizes.weights + n * sizes.out_stride + k];
+        return parameters[sizes.weights + n * sizes.weight_stride + k];
     }
     if sizes.unit == 1u {
         return select(0.0, 1.0, n == 0u);
     }
-    return z[k * sizes.out_stride + n];
+    // Behind the outputs a skip layer has other numbers.
+    return select(0.0, z[k * sizes.out_stride + n], n < sizes.outputs);
 }
 
 fn activated(v: f32) -> f32 {
@@ -96,16 +103,16 @@ fn slope(h: f32) -> f32 {
 
 fn store(m: u32, n: u32, piece: u32, sum: f32) {
     if product == 0u {
-        let bias = sizes.weights + sizes.inputs * sizes.out_stride + n;
+        let bias = sizes.weights + sizes.inputs * sizes.weight_stride + n;
         // Padding stays zero, which softplus would not keep.
-        let inside = n < sizes.outputs;
-        z[m * sizes.out_stride + n] = select(select(0.0, activated(sum + parameters[bias]), inside), sum, sizes.tangent == 1u);
+        let h = select(0.0, activated(sum + parameters[bias]) * sizes.out_scale, n < sizes.outputs);
+        z[m * sizes.out_stride + n] = select(h, sum, sizes.tangent == 1u);
     } else if product == 1u {
         let at = m * sizes.in_stride + n;
-        dx[at] = sum * slope(x[at]);
+        dx[at] = sum * sizes.in_scale * select(1.0, slope(x[at] / sizes.in_scale), n < sizes.own);
     } else {
-        let at = piece * sizes.parameters + sizes.weights + m * sizes.out_stride + n;
-        partial_sums[at] = select(sum, partial_sums[at] + sum, sizes.tangent == 1u);
+        let at = piece * sizes.parameters + sizes.weights + m * sizes.weight_stride + n;
+        partial_sums[at] += sum;
     }
 }
 
@@ -117,7 +124,7 @@ fn multiply(
 ) {
     // C is [height, width], and the sum runs over first..last.
     var height = sizes.rows;
-    var width = sizes.out_stride;
+    var width = sizes.weight_stride;
     var first = 0u;
     var last = sizes.inputs;
     if product == 1u {

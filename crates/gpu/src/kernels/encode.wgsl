@@ -1,12 +1,13 @@
-// The multi-resolution hash encoding, its gradient and its scatter. Twin: `HashGrid`, whose module has the formulas.
-// One thread for each sample and level, but for `normals`: one for each sample.
+// Tables of numbers at the corners of grids, sampled trilinearly: the multi-resolution hash encoding and dense voxels; their
+// gradient and their scatter. Twins: `HashGrid`, whose module has the formulas, and `DenseGrid`.
+// One thread for each sample, level and four of its features, but for `normals_of`: one for each sample.
 
-const MOST_FEATURES = 8u;
+const PART = 4u;
 
 struct Sizes {
     samples: u32,
     levels: u32,
-    // Of a level, at most MOST_FEATURES.
+    // Of a level.
     features: u32,
     // Row length of the features, and the encoding's first column. Where that is 3, the position in -1..1 comes first.
     stride: u32,
@@ -17,9 +18,18 @@ struct Sizes {
     units: f32,
 }
 
+struct Level {
+    // Along x, y and z; a hash grid has equally many.
+    cells: vec3<u32>,
+    // 1 where each corner has an entry of its own.
+    dense: u32,
+    // Where its features begin in the table.
+    offset: u32,
+    entries: u32,
+}
+
 @group(0) @binding(0) var<uniform> sizes: Sizes;
-// [levels]: cells a side, offset of the first feature, entries, 1 where each corner has an entry of its own.
-@group(0) @binding(1) var<storage, read> levels: array<vec4<u32>>;
+@group(0) @binding(1) var<storage, read> levels: array<Level>;
 // [samples, 3]: position in the unit cube.
 @group(0) @binding(2) var<storage, read> positions: array<f32>;
 @group(0) @binding(3) var<storage, read> table: array<f32>;
@@ -37,37 +47,46 @@ struct Cell {
     t: vec3<f32>,
 }
 
-fn cell_of(sample: u32, cells: u32) -> Cell {
+fn cell_of(sample: u32, cells: vec3<u32>) -> Cell {
     let p = vec3(positions[3u * sample], positions[3u * sample + 1u], positions[3u * sample + 2u]);
-    let at = clamp(p * f32(cells), vec3(0.0), vec3(f32(cells)));
-    let base = min(vec3<u32>(at), vec3(cells - 1u));
+    let at = clamp(p * vec3<f32>(cells), vec3(0.0), vec3<f32>(cells));
+    let base = min(vec3<u32>(at), cells - 1u);
     return Cell(base, at - vec3<f32>(base));
 }
 
 // Where the features of a corner begin in the table.
-fn entry(level: vec4<u32>, cell: Cell, corner: u32) -> u32 {
+fn entry(level: Level, cell: Cell, corner: u32) -> u32 {
     let c = cell.base + vec3(corner & 1u, (corner >> 1u) & 1u, corner >> 2u);
-    let side = level.x + 1u;
-    let dense = (c.z * side + c.y) * side + c.x;
-    let hashed = (c.x ^ (c.y * 2654435761u) ^ (c.z * 805459861u)) & (level.z - 1u);
-    return level.y + select(hashed, dense, level.w == 1u) * sizes.features;
+    let dense = (c.z * (level.cells.y + 1u) + c.y) * (level.cells.x + 1u) + c.x;
+    let hashed = (c.x ^ (c.y * 2654435761u) ^ (c.z * 805459861u)) & (level.entries - 1u);
+    return level.offset + select(hashed, dense, level.dense == 1u) * sizes.features;
 }
 
-// What a thread works on: a sample's cell in a level, and where the level's features begin in the sample's row.
+// A sample's cell in a level, and where the level's features begin in the sample's row.
 struct Place {
-    sample: u32,
-    l: u32,
-    level: vec4<u32>,
+    level: Level,
     cell: Cell,
     row: u32,
 }
 
-fn place_of(thread: u32) -> Place {
-    let l = thread % sizes.levels;
-    let sample = thread / sizes.levels;
+fn place_of(sample: u32, l: u32) -> Place {
     let level = levels[l];
-    let row = sample * sizes.stride + sizes.first + l * sizes.features;
-    return Place(sample, l, level, cell_of(sample, level.x), row);
+    return Place(level, cell_of(sample, level.cells), sample * sizes.stride + sizes.first + l * sizes.features);
+}
+
+// What a thread works on: the features `first..last` of a sample's level.
+struct Part {
+    sample: u32,
+    l: u32,
+    first: u32,
+    last: u32,
+}
+
+fn part_of(thread: u32) -> Part {
+    let parts = (sizes.features + PART - 1u) / PART;
+    let first = thread % parts * PART;
+    let l = thread / parts % sizes.levels;
+    return Part(thread / parts / sizes.levels, l, first, min(first + PART, sizes.features));
 }
 
 fn weight(cell: Cell, corner: u32) -> f32 {
@@ -78,25 +97,25 @@ fn weight(cell: Cell, corner: u32) -> f32 {
 
 @compute @workgroup_size(64)
 fn forward(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let thread = id.y * groups.x * 64u + id.x;
-    if thread >= sizes.samples * sizes.levels {
+    let part = part_of(id.y * groups.x * 64u + id.x);
+    if part.sample >= sizes.samples {
         return;
     }
-    let at = place_of(thread);
-    var sums = array<f32, MOST_FEATURES>();
-    for (var c = 0u; c < 8u && at.l < sizes.active_levels; c += 1u) {
+    let at = place_of(part.sample, part.l);
+    var sums = array<f32, PART>();
+    for (var c = 0u; c < 8u && part.l < sizes.active_levels; c += 1u) {
         let w = weight(at.cell, c);
         let from_entry = entry(at.level, at.cell, c);
-        for (var f = 0u; f < sizes.features; f += 1u) {
-            sums[f] += w * table[from_entry + f];
+        for (var f = part.first; f < part.last; f += 1u) {
+            sums[f - part.first] += w * table[from_entry + f];
         }
     }
-    for (var f = 0u; f < sizes.features; f += 1u) {
-        features[at.row + f] = sums[f];
+    for (var f = part.first; f < part.last; f += 1u) {
+        features[at.row + f] = sums[f - part.first];
     }
-    if at.l == 0u && sizes.first == 3u {
+    if part.l == 0u && part.first == 0u && sizes.first == 3u {
         for (var d = 0u; d < 3u; d += 1u) {
-            features[at.sample * sizes.stride + d] = 2.0 * positions[3u * at.sample + d] - 1.0;
+            features[part.sample * sizes.stride + d] = 2.0 * positions[3u * part.sample + d] - 1.0;
         }
     }
 }
@@ -122,14 +141,14 @@ fn normals_of(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgro
     }
     var n = vec3(0.0);
     for (var l = 0u; l < sizes.active_levels; l += 1u) {
-        let at = place_of(sample * sizes.levels + l);
+        let at = place_of(sample, l);
         for (var c = 0u; c < 8u; c += 1u) {
             let from_entry = entry(at.level, at.cell, c);
             var dot_g = 0.0;
             for (var f = 0u; f < sizes.features; f += 1u) {
                 dot_g += features[at.row + f] * table[from_entry + f];
             }
-            n += 0.5 * f32(at.level.x) * dot_g * weight_gradient(at.cell, c);
+            n += 0.5 * vec3<f32>(at.level.cells) * dot_g * weight_gradient(at.cell, c);
         }
     }
     for (var d = 0u; d < 3u; d += 1u) {
@@ -140,26 +159,26 @@ fn normals_of(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgro
 // dg = J dn.
 @compute @workgroup_size(64)
 fn tangent(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let thread = id.y * groups.x * 64u + id.x;
-    if thread >= sizes.samples * sizes.levels {
+    let part = part_of(id.y * groups.x * 64u + id.x);
+    if part.sample >= sizes.samples {
         return;
     }
-    let at = place_of(thread);
-    let d_n = normal_of(at.sample);
-    var sums = array<f32, MOST_FEATURES>();
-    for (var c = 0u; c < 8u && at.l < sizes.active_levels; c += 1u) {
-        let w = 0.5 * f32(at.level.x) * dot(weight_gradient(at.cell, c), d_n);
+    let at = place_of(part.sample, part.l);
+    let d_n = normal_of(part.sample);
+    var sums = array<f32, PART>();
+    for (var c = 0u; c < 8u && part.l < sizes.active_levels; c += 1u) {
+        let w = dot(0.5 * vec3<f32>(at.level.cells) * weight_gradient(at.cell, c), d_n);
         let from_entry = entry(at.level, at.cell, c);
-        for (var f = 0u; f < sizes.features; f += 1u) {
-            sums[f] += w * table[from_entry + f];
+        for (var f = part.first; f < part.last; f += 1u) {
+            sums[f - part.first] += w * table[from_entry + f];
         }
     }
-    for (var f = 0u; f < sizes.features; f += 1u) {
-        features[at.row + f] = sums[f];
+    for (var f = part.first; f < part.last; f += 1u) {
+        features[at.row + f] = sums[f - part.first];
     }
-    if at.l == 0u {
+    if part.l == 0u && part.first == 0u {
         for (var d = 0u; d < 3u; d += 1u) {
-            features[at.sample * sizes.stride + d] = d_n[d];
+            features[part.sample * sizes.stride + d] = d_n[d];
         }
     }
 }
@@ -186,15 +205,15 @@ fn add(parameter: u32, share: f32) {
 
 @compute @workgroup_size(64)
 fn scatter(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let thread = id.y * groups.x * 64u + id.x;
-    if thread >= sizes.samples * sizes.levels || thread % sizes.levels >= sizes.active_levels {
+    let part = part_of(id.y * groups.x * 64u + id.x);
+    if part.sample >= sizes.samples || part.l >= sizes.active_levels {
         return;
     }
-    let at = place_of(thread);
+    let at = place_of(part.sample, part.l);
     for (var c = 0u; c < 8u; c += 1u) {
         let w = weight(at.cell, c);
         let to = entry(at.level, at.cell, c);
-        for (var f = 0u; f < sizes.features; f += 1u) {
+        for (var f = part.first; f < part.last; f += 1u) {
             add(to + f, w * features[at.row + f]);
         }
     }
@@ -203,17 +222,17 @@ fn scatter(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups
 // With the part that a loss on normals asks for.
 @compute @workgroup_size(64)
 fn scatter_both(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let thread = id.y * groups.x * 64u + id.x;
-    if thread >= sizes.samples * sizes.levels || thread % sizes.levels >= sizes.active_levels {
+    let part = part_of(id.y * groups.x * 64u + id.x);
+    if part.sample >= sizes.samples || part.l >= sizes.active_levels {
         return;
     }
-    let at = place_of(thread);
-    let d_n = normal_of(at.sample);
+    let at = place_of(part.sample, part.l);
+    let d_n = normal_of(part.sample);
     for (var c = 0u; c < 8u; c += 1u) {
         let w = weight(at.cell, c);
-        let w_n = 0.5 * f32(at.level.x) * dot(weight_gradient(at.cell, c), d_n);
+        let w_n = dot(0.5 * vec3<f32>(at.level.cells) * weight_gradient(at.cell, c), d_n);
         let to = entry(at.level, at.cell, c);
-        for (var f = 0u; f < sizes.features; f += 1u) {
+        for (var f = part.first; f < part.last; f += 1u) {
             add(to + f, w * features[at.row + f] + w_n * gradient[at.row + f]);
         }
     }

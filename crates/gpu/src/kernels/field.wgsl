@@ -1,16 +1,22 @@
-// What lies between the two networks of a radiance field, and of a field of distance. Twins: `RadianceField`, `SdfField`.
+// What lies between the two networks of a radiance field, of a field of distance and of a field of frequencies. Twins:
+// `RadianceField`, `SdfField` and `FrequencyField`.
 
 struct Sizes {
     samples: u32,
     // Cells a side of the occupancy grid.
     resolution: u32,
-    // Of a distance field: samples that have a colour, the features that it gets, and row lengths of the geometry network's
-    // output, of its input and of the colour network's input.
+    // Of a distance field: samples that have a colour. Of both others: the features that a colour gets, and row lengths of the
+    // geometry network's output, of its input and of the colour network's input.
     colored: u32,
     features: u32,
     geometry_stride: u32,
     encoded_stride: u32,
     color_stride: u32,
+    // Of a distance field: columns of the encoded direction, and 1 where they are harmonics, else the host writes them.
+    directions: u32,
+    harmonics: u32,
+    // Of a field of frequencies, as composite.wgsl numbers it: the density is 1 max(o, 0), 2 ln(1 + exp(o)).
+    activation: u32,
 }
 
 @group(0) @binding(0) var<uniform> sizes: Sizes;
@@ -104,7 +110,7 @@ fn join(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
     geometry[16u * i] += sigma[i];
 }
 
-// Position, normal, harmonics, features.
+// Position, normal, direction, features.
 @compute @workgroup_size(64)
 fn split_sdf(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     let i = id.y * groups.x * 64u + id.x;
@@ -116,9 +122,11 @@ fn split_sdf(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgrou
         color_in[to + d] = encoded[sizes.encoded_stride * i + d];
         color_in[to + 3u + d] = normals[3u * i + d];
     }
-    write_harmonics(i, to + 6u);
+    if sizes.harmonics == 1u {
+        write_harmonics(i, to + 6u);
+    }
     for (var k = 0u; k < sizes.features; k += 1u) {
-        color_in[to + 22u + k] = geometry[sizes.geometry_stride * i + 1u + k];
+        color_in[to + 6u + sizes.directions + k] = geometry[sizes.geometry_stride * i + 1u + k];
     }
 }
 
@@ -136,11 +144,50 @@ fn join_sdf(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroup
         if has_color && k == 0u {
             d = sigma[i];
         } else if has_color && k <= sizes.features {
-            d = color_in[sizes.color_stride * i + 21u + k];
+            d = color_in[sizes.color_stride * i + 5u + sizes.directions + k];
         }
         geometry[to + k] = d;
     }
     for (var d = 0u; d < 3u && has_color; d += 1u) {
         normals[3u * i + d] += color_in[sizes.color_stride * i + 3u + d];
+    }
+}
+
+@compute @workgroup_size(64)
+fn density_of_frequencies(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let i = id.y * groups.x * 64u + id.x;
+    if i < sizes.samples {
+        let o = geometry[sizes.geometry_stride * i];
+        let e = exp(-abs(o));
+        let rest = select(log(1.0 + e), e * (1.0 - e * (0.5 - e / 3.0)), e < 0.01);
+        sigma[i] = max(o, 0.0) + select(0.0, rest, sizes.activation == 2u);
+    }
+}
+
+// One thread for each sample and feature.
+@compute @workgroup_size(64)
+fn split_frequencies(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let thread = id.y * groups.x * 64u + id.x;
+    let i = thread / sizes.features;
+    let k = thread % sizes.features;
+    if i < sizes.samples {
+        color_in[sizes.color_stride * i + k] = geometry[sizes.geometry_stride * i + 1u + k];
+    }
+}
+
+// One thread for each sample and number of its row.
+@compute @workgroup_size(64)
+fn join_frequencies(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let thread = id.y * groups.x * 64u + id.x;
+    let i = thread / sizes.geometry_stride;
+    let k = thread % sizes.geometry_stride;
+    if i < sizes.samples {
+        var d = 0.0;
+        if k == 0u {
+            d = sigma[i];
+        } else if k <= sizes.features {
+            d = color_in[sizes.color_stride * i + k - 1u];
+        }
+        geometry[thread] = d;
     }
 }

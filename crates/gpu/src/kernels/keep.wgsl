@@ -1,5 +1,6 @@
-// Drops the samples that no light reaches. Twin: `RaySamples::drop_dark` with `Neus::shade`, which judges by the drop of the
-// logistic function between neighbours. `count` runs first; the host adds up the counts; `compact` moves what stays.
+// Drops samples. `count`, here or in voxels.wgsl, judges them; the host adds up the counts; `compact` moves what stays.
+// This `count` drops what no light reaches. Twin: `RaySamples::drop_dark` with `Neus::shade`, which judges by the drop of the
+// logistic function between neighbours.
 
 struct Sizes {
     rays: u32,
@@ -22,6 +23,8 @@ struct Sizes {
 @group(0) @binding(6) var<storage, read_write> kept_positions: array<f32>;
 @group(0) @binding(7) var<storage, read_write> kept_steps: array<vec2<f32>>;
 @group(0) @binding(8) var<storage, read_write> ray_of: array<u32>;
+// [samples]: 1 where the sample stays, as `count` judged it.
+@group(0) @binding(9) var<storage, read_write> stays: array<u32>;
 
 fn logistic(i: u32) -> f32 {
     return 1.0 / (1.0 + exp(-clamp(sizes.sharpness * geometry[sizes.stride * i], -80.0, 80.0)));
@@ -43,6 +46,9 @@ fn count(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) 
         i += 1u;
     }
     kept[ray] = i - starts[ray];
+    for (var k = starts[ray]; k < last; k += 1u) {
+        stays[k] = select(0u, 1u, k < i);
+    }
 }
 
 @compute @workgroup_size(64)
@@ -51,13 +57,15 @@ fn compact(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups
     if ray >= sizes.rays {
         return;
     }
-    let first = starts[ray];
-    for (var to = kept[ray]; to < kept[ray + 1u]; to += 1u) {
-        let from_sample = first + to - kept[ray];
-        for (var d = 0u; d < 3u; d += 1u) {
-            kept_positions[3u * to + d] = positions[3u * from_sample + d];
+    var to = kept[ray];
+    for (var i = starts[ray]; i < starts[ray + 1u]; i += 1u) {
+        if stays[i] == 1u {
+            for (var d = 0u; d < 3u; d += 1u) {
+                kept_positions[3u * to + d] = positions[3u * i + d];
+            }
+            kept_steps[to] = steps[i];
+            ray_of[to] = ray;
+            to += 1u;
         }
-        kept_steps[to] = steps[from_sample];
-        ray_of[to] = ray;
     }
 }

@@ -1,9 +1,11 @@
-// Samples of rays, wherever the occupancy grid has matter: through contracted space, or inside the unit ball. Twins:
-// `Nerf::march` and `Neus::march`.
+// Samples of rays, wherever the occupancy grid has matter: through contracted space, or inside the unit ball or the cube
+// around it. Twins: `Nerf::march`, `Neus::march` and `Dvgo::march`.
 // `count` runs first; the host adds up the counts and gives each ray its place; `place` writes the samples.
 
-// Inside the ball steps have one length.
+// Inside the ball or its cube steps have one length.
 override inside_ball: bool;
+// Samples lie in a box of voxels; contracted space has steps that are equally long there.
+override voxels: bool;
 
 struct Sizes {
     rays: u32,
@@ -12,17 +14,24 @@ struct Sizes {
     far: f32,
     step: f32,
     cone: f32,
+    // The box of voxels, in the unit cube.
+    low_x: f32,
+    low_y: f32,
+    low_z: f32,
+    high_x: f32,
+    high_y: f32,
+    high_z: f32,
 }
 
 @group(0) @binding(0) var<uniform> sizes: Sizes;
 // [rays, 20]: origin, direction, jitter, wanted colour, background, where contracted space begins, where the ball begins and
-// ends, the mask (negative: none); three are unused.
+// ends, the mask (negative: none), the colour that was photographed.
 @group(0) @binding(1) var<storage, read> rays: array<f32>;
 // [cells]: not zero where the cell may hold something, x fastest.
 @group(0) @binding(2) var<storage, read> occupied: array<u32>;
 // `count` writes [rays]: samples of each ray. `place` reads [rays + 1]: where they begin.
 @group(0) @binding(3) var<storage, read_write> starts: array<u32>;
-// [samples, 3]: position in the unit cube.
+// [samples, 3]: position in the unit cube; of voxels, in their box.
 @group(0) @binding(4) var<storage, read_write> positions: array<f32>;
 // [samples]: distance and length of the step.
 @group(0) @binding(5) var<storage, read_write> steps: array<vec2<f32>>;
@@ -52,17 +61,27 @@ fn walk(ray: u32, write: bool, first: u32, last: u32) -> u32 {
     var t = start + rays[at + 6u] * max(start * cone, sizes.step);
     var next = first;
     while t < end && next < last {
-        let dt = max(t * cone, sizes.step);
+        var dt = max(t * cone, sizes.step);
         let p = origin + t * direction;
         var u = 0.5 * p + 0.5;
         if !inside_ball {
             u = contract(p);
         }
-        if is_occupied(u) {
+        var place = u;
+        if voxels {
+            if !inside_ball {
+                // Contraction shrinks radial steps by the square of the distance.
+                let reach = max(1.0, max(abs(p.x), max(abs(p.y), abs(p.z))));
+                dt = min(sizes.step * reach * reach, 0.5 * reach);
+            }
+            let low = vec3(sizes.low_x, sizes.low_y, sizes.low_z);
+            place = (u - low) / (vec3(sizes.high_x, sizes.high_y, sizes.high_z) - low);
+        }
+        if is_occupied(u) && (!voxels || (all(place >= vec3(0.0)) && all(place <= vec3(1.0)))) {
             if write {
-                positions[3u * next] = u.x;
-                positions[3u * next + 1u] = u.y;
-                positions[3u * next + 2u] = u.z;
+                positions[3u * next] = place.x;
+                positions[3u * next + 1u] = place.y;
+                positions[3u * next + 2u] = place.z;
                 steps[next] = vec2(t, dt);
                 ray_of[next] = ray;
             }

@@ -22,6 +22,8 @@ struct Sizes {
     // Free points, behind the samples.
     samples: u32,
     free: u32,
+    // `losses_of_sections`: square of the eikonal loss's reach around the centre.
+    reach: f32,
 }
 
 @group(0) @binding(0) var<uniform> sizes: Sizes;
@@ -216,4 +218,116 @@ fn free_points(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgr
         let k = sizes.samples + i;
         set_normal(k, eikonal(normal_of(k), sizes.eikonal_free).xyz);
     }
+}
+
+fn slope_of_softplus(sigma: f32) -> f32 {
+    return select(1.0 - exp(-sigma), sigma * (1.0 - 0.5 * sigma), sigma < 1e-3);
+}
+
+// The same of the original NeuS. Twins: `NeusOriginal::losses` and `NeusOriginal::send_back`. Sections inside and outside the
+// ball alternate by distance; those inside with a negative length are not shown. Densities are a softplus's. The ray's
+// wanted colour and its error have the mask as their share, and its number 17 is the eikonal loss's weight.
+@compute @workgroup_size(64)
+fn losses_of_sections(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let ray = id.y * groups.x * 64u + id.x;
+    if ray >= sizes.rays {
+        return;
+    }
+    let at = ray * 20u;
+    let origin = vec3(rays[at], rays[at + 1u], rays[at + 2u]);
+    let direction = direction_of(ray);
+    let wanted = vec3(rays[at + 7u], rays[at + 8u], rays[at + 9u]);
+    let mask = rays[at + 16u];
+    let share = select(1.0, mask, mask >= 0.0);
+    let first = starts[ray];
+    let last = starts[ray + 1u];
+    var outer_first = 0u;
+    var outer_last = 0u;
+    if sizes.with_background == 1u {
+        outer_first = outer_starts[ray];
+        outer_last = outer_starts[ray + 1u];
+    }
+
+    // Front to back. What reaches a sample is kept in its derivative until that is known.
+    var light = 1.0;
+    var sum = vec3(0.0);
+    var i = first;
+    var o = outer_first;
+    while i < last || o < outer_last {
+        if i < last && steps[i].y < 0.0 {
+            i += 1u;
+        } else if o == outer_last || (i < last && steps[i].x <= outer_steps[o].x) {
+            let alpha = section_of(i, direction).alpha;
+            d_color[8u * i] = light;
+            sum += light * alpha * rgb_of(i);
+            light *= 1.0 - alpha;
+            i += 1u;
+        } else {
+            let alpha = opacity(o);
+            d_outer_color[8u * o] = light;
+            sum += light * alpha * outer_rgb_of(o);
+            light *= 1.0 - alpha;
+            o += 1u;
+        }
+    }
+    let error = (sum - wanted) * share;
+    var loss = abs(error.x) + abs(error.y) + abs(error.z);
+    var behind = 0.0;
+    if mask >= 0.0 {
+        let cover = clamp(1.0 - light, 1e-3, 1.0 - 1e-3);
+        loss -= sizes.mask * (mask * log(cover) + (1.0 - mask) * log(1.0 - cover));
+        behind = sizes.mask * sizes.scale * (mask / cover - (1.0 - mask) / (1.0 - cover));
+    }
+
+    // Back to front.
+    let d = sign(error) * sizes.scale * share;
+    var d_sharpness = 0.0;
+    while i > first || o > outer_first {
+        let k = i - 1u;
+        if i > first && (o == outer_first || steps[k].y < 0.0 || steps[k].x > outer_steps[o - 1u].x) {
+            let n = normal_of(k);
+            let p = origin + steps[k].x * direction;
+            let pull = eikonal(n, select(0.0, rays[at + 17u], dot(p, p) < sizes.reach));
+            loss += pull.w * f32(sizes.rays);
+            var d_n = pull.xyz;
+            var d_rgb = vec3(0.0);
+            d_sdf[k] = 0.0;
+            if steps[k].y >= 0.0 {
+                let s = section_of(k, direction);
+                let rgb = rgb_of(k);
+                let reach = d_color[8u * k];
+                let q = dot(d, rgb);
+                let d_alpha = reach * (q - behind);
+                behind = s.alpha * q + (1.0 - s.alpha) * behind;
+                d_sdf[k] = d_alpha * s.by.x;
+                d_sharpness += d_alpha * s.by.z;
+                d_n += d_alpha * s.by.y * direction;
+                d_rgb = d * reach * s.alpha * rgb * (1.0 - rgb);
+            }
+            set_normal(k, d_n);
+            for (var c = 0u; c < 8u; c += 1u) {
+                d_color[8u * k + c] = 0.0;
+            }
+            d_color[8u * k] = d_rgb.x;
+            d_color[8u * k + 1u] = d_rgb.y;
+            d_color[8u * k + 2u] = d_rgb.z;
+            i = k;
+        } else {
+            o -= 1u;
+            let alpha = opacity(o);
+            let rgb = outer_rgb_of(o);
+            let reach = d_outer_color[8u * o];
+            let q = dot(d, rgb);
+            d_density[o] = reach * (q - behind) * outer_steps[o].y * (1.0 - alpha) * slope_of_softplus(sigma[o]);
+            behind = alpha * q + (1.0 - alpha) * behind;
+            let d_rgb = d * reach * alpha * rgb * (1.0 - rgb);
+            for (var c = 0u; c < 8u; c += 1u) {
+                d_outer_color[8u * o + c] = 0.0;
+            }
+            d_outer_color[8u * o] = d_rgb.x;
+            d_outer_color[8u * o + 1u] = d_rgb.y;
+            d_outer_color[8u * o + 2u] = d_rgb.z;
+        }
+    }
+    losses[ray] = vec4(dot(error, error), loss, d_sharpness, 0.0);
 }
