@@ -287,12 +287,17 @@ pub fn align_bundle(sequence: &Sequence, options: &BundleOptions, progress: &dyn
     let covariances = covariances.ok_or_else(|| {
         Error::Failed("the cameras are not determined: too few features and edges in common".to_owned())
     })?;
+    let covariances: Vec<Matrix6<f64>> = covariances.into_iter().map(|c| c * COMMON_ERRORS.powi(2)).collect();
 
     let summary = summarise(sequence, &adjustment, &phone, &covariances, &edge_agreement, dropped);
     write(sequence, &adjustment, &phone, &start, &covariances, &summary)?;
     steps.step()?;
     Ok(summary)
 }
+
+/// Frames lie this much farther off than the equations say, which take errors to be independent: 1.6 times in the root mean
+/// square of eight simulated captures, between 1.0 and 2.8 times, and much alike in all frames of one.
+const COMMON_ERRORS: f64 = 1.6;
 
 /// The aligned model.
 struct Map<'a> {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use mb_capture::{Alignment, AlignmentStage, FrameId, Keypoints, Sequence};
 use mb_geometry::{Object, Rigid3, World};
 use mb_job::{Error, InputError, Progress, Result, Steps};
-use nalgebra::Point2;
+use nalgebra::{Matrix2, Matrix2x6, Matrix6, Point2, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::model_scale::fitting_scale;
@@ -60,6 +60,9 @@ pub struct KeypointSummary {
     /// Whether the frames' clicks only agree if the phone's poses have drifted; residuals are then after a small motion
     /// of each frame, and the covariance takes the drifts as independent.
     pub poses_drifted: bool,
+    /// Whether the pose was drawn from the one that the clicks alone give, which the residuals belong to, towards upright:
+    /// done where the model's y axis lies within three standard deviations of the world's, as on a table under a phone.
+    pub drawn_upright: bool,
     /// The file written.
     pub written: PathBuf,
     /// What deserves a look.
@@ -141,7 +144,8 @@ pub fn align_keypoints(
             .help("Lengths are metres in point_in_object_m, model/mesh.ply and pose/: 1 LDraw unit is 0.0004 m")
             .into());
     }
-    let (estimate, drifted) = found.map_err(|e| explain(&path, &e))?;
+    let (mut estimate, drifted) = found.map_err(|e| explain(&path, &e))?;
+    let is_drawn_upright = draw_upright(&mut estimate);
 
     let written = begin_stage(sequence)?;
     put_phone_cameras_back(sequence, &phone)?;
@@ -155,7 +159,7 @@ pub fn align_keypoints(
     }
     .write(&written)?;
     steps.step()?;
-    let mut summary = summary(&keypoints, &estimate, ids.len(), drifted, written);
+    let mut summary = summary(&keypoints, &estimate, ids.len(), [drifted, is_drawn_upright], written);
     if let Some(factor) = size {
         summary.warnings.push(format!(
             "the clicks agree better with a model {factor:.3} times as large: check the units of the model and of the phone's poses"
@@ -190,6 +194,32 @@ fn estimate(
         Ok(drifted) => Ok((drifted, true)),
         Err(_) => Ok((exact, false)),
     }
+}
+
+/// Standard deviation of the tilt of a model on a table in a world aligned with gravity, radians: one degree.
+const UPRIGHT_RAD: f64 = std::f64::consts::PI / 180.0;
+
+/// Where the tilt may be chance, weighs it against [`UPRIGHT_RAD`] (the update of a Kalman filter) and returns `true`. Clicks on a
+/// small object say little of its tilt, and gravity says much.
+fn draw_upright(estimate: &mut PoseEstimate) -> bool {
+    let up = estimate.world_from_object.rotate(&Vector3::y());
+    // The rotation about the world's x and z that would bring it upright.
+    let tilt = Vector2::new(-up.z, up.x);
+    let mut by_motion = Matrix2x6::zeros();
+    (by_motion[(0, 0)], by_motion[(1, 2)]) = (1.0, 1.0);
+    let covariance = estimate.covariance;
+    let spread = by_motion * covariance * by_motion.transpose() + Matrix2::identity() * UPRIGHT_RAD.powi(2);
+    let Some(information) = spread.try_inverse() else { return false };
+    if up.y <= 0.0 || (tilt.transpose() * information * tilt)[0] > 9.0 {
+        return false;
+    }
+    let gain = covariance * by_motion.transpose() * information;
+    estimate.world_from_object = Rigid3::exp(&(gain * tilt)) * estimate.world_from_object;
+    let kept = Matrix6::identity() - gain * by_motion;
+    // Joseph's form stays symmetric and positive.
+    estimate.covariance = kept * covariance * kept.transpose() + gain * gain.transpose() * UPRIGHT_RAD.powi(2);
+    estimate.rotation_std_rad = estimate.covariance.fixed_view::<3, 3>(0, 0).trace().sqrt();
+    true
 }
 
 /// Refuses what no annotator can have clicked.
@@ -259,7 +289,7 @@ fn summary(
     keypoints: &Keypoints,
     estimate: &PoseEstimate,
     frames: usize,
-    poses_drifted: bool,
+    [poses_drifted, drawn_upright]: [bool; 2],
     written: PathBuf,
 ) -> KeypointSummary {
     let residuals: Vec<KeypointResidual> = keypoints
@@ -314,6 +344,7 @@ fn summary(
         condition: estimate.condition,
         layout: estimate.layout,
         poses_drifted,
+        drawn_upright,
         written,
         warnings,
     }
@@ -326,4 +357,61 @@ fn wrong_click(r: &KeypointResidual, estimate: &PoseEstimate) -> String {
         None => "lies behind the camera".to_owned(),
     };
     format!("keypoint {}{name} in frame {} {why}: a wrong click, left out", r.index, r.frame)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::UnitQuaternion;
+
+    fn tilted(degrees: f64, std_deg: f64) -> PoseEstimate {
+        let rotation = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), degrees.to_radians())
+            * UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.8);
+        let mut covariance = Matrix6::identity() * 1e-6;
+        covariance.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
+        covariance.fixed_view_mut::<3, 3>(0, 0).scale_mut(std_deg.to_radians().powi(2));
+        PoseEstimate {
+            world_from_object: Rigid3::from_parts(rotation, Vector3::new(0.3, -0.2, 0.5)),
+            covariance,
+            rotation_std_rad: 3f64.sqrt() * std_deg.to_radians(),
+            centroid_std_m: 1e-3,
+            condition: 1.0,
+            residuals_px: Vec::new(),
+            inliers: Vec::new(),
+            limit_px: 1.0,
+            rms_px: 1.0,
+            layout: PointLayout::Solid,
+        }
+    }
+
+    fn tilt_deg(estimate: &PoseEstimate) -> f64 {
+        estimate.world_from_object.rotate(&Vector3::y()).angle(&Vector3::y()).to_degrees()
+    }
+
+    #[test]
+    fn a_tilt_that_may_be_chance_is_weighed_against_gravity() {
+        // Equal trust in clicks and table: half of it goes, and the turn about the vertical stays.
+        let mut estimate = tilted(1.0, 1.0);
+        assert!(draw_upright(&mut estimate));
+        assert!((tilt_deg(&estimate) - 0.5).abs() < 1e-3, "{}", tilt_deg(&estimate));
+        let x = estimate.world_from_object.rotate(&Vector3::x());
+        assert!(((-x.z).atan2(x.x) - 0.8).abs() < 1e-3);
+        let variances = estimate.covariance.diagonal().map(|v| v.sqrt().to_degrees());
+        assert!((variances[0] - 0.5f64.sqrt()).abs() < 1e-9 && (variances[1] - 1.0).abs() < 1e-9);
+
+        // Good clicks are believed.
+        let mut estimate = tilted(1.0, 0.05);
+        assert!(draw_upright(&mut estimate));
+        assert!(tilt_deg(&estimate) > 0.99);
+    }
+
+    #[test]
+    fn a_model_that_leans_or_lies_stays_as_clicked() {
+        for degrees in [6.0, 90.0, 180.0] {
+            let mut estimate = tilted(degrees, 1.0);
+            let before = estimate.clone();
+            assert!(!draw_upright(&mut estimate));
+            assert_eq!(estimate, before);
+        }
+    }
 }
