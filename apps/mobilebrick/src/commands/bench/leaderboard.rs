@@ -48,12 +48,11 @@ impl Leaderboard {
             .collect();
         let options = LeaderboardOptions { title: self.title, pictures: !self.no_pictures, seed: self.seed.seed };
         let summary = leaderboard(&results, &self.out, &options, terminal)?;
-        let text = format!(
-            "{} sequences, {} pictures drawn; open {}",
-            summary.sequences.len(),
-            summary.pictures_drawn,
-            summary.index.display()
-        );
+        let sequences = match summary.sequences.len() {
+            1 => "1 sequence".to_owned(),
+            n => format!("{n} sequences"),
+        };
+        let text = format!("{sequences}, {} pictures drawn; open {}", summary.pictures_drawn, summary.index.display());
         Outcome::new(&summary, text)
     }
 }
