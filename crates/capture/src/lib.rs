@@ -29,7 +29,7 @@ pub use import::{CaptureFormat, ImportOptions, ImportSummary, SkippedFrame, impo
 pub use keypoints::{Keypoint, Keypoints};
 pub use lens::{Distortion, Lens};
 pub use matrix_txt::{read_intrinsics_txt, read_pose_txt, write_intrinsics_txt, write_pose_txt};
-pub use neus_cameras::write_neus_cameras;
+pub use neus_cameras::{ObjectSphere, read_neus_sphere, write_neus_cameras};
 pub use pose_folder::PoseFolder;
 pub use sequence::{Frame, FrameId, Sequence, SequenceMeta};
 pub use visibility::VisibilityVolume;

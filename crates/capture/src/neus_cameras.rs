@@ -4,13 +4,14 @@ use std::io::{Cursor, Write as _};
 use std::path::Path;
 
 use mb_geometry::{Aabb, Camera, Intrinsics, Rigid3, World};
-use mb_job::{Error, Result, write_atomic};
-use nalgebra::{Matrix3, Matrix3x4, Matrix4, Rotation3, UnitQuaternion};
+use mb_job::{Error, InputError, Result, write_atomic};
+use nalgebra::{Matrix3, Matrix3x4, Matrix4, Point3, Rotation3, UnitQuaternion};
 use npyz::WriterBuilder as _;
 use zip::ZipWriter;
 use zip::write::SimpleFileOptions;
 
 use crate::Frame;
+use crate::import::archive::Archive;
 
 /// How much larger than the object's box the unit sphere of `scale_mat_i` is.
 const MARGIN: f64 = 1.1;
@@ -42,6 +43,33 @@ pub fn write_neus_cameras(path: impl AsRef<Path>, frames: &[Frame], object_in_wo
         }
     }
     write_atomic(path, archive.finish().map_err(|e| fail(e.into()))?.get_ref())
+}
+
+/// A sphere around the object, in the world frame, metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ObjectSphere {
+    /// Its centre.
+    pub center: Point3<f64>,
+    /// Its radius.
+    pub radius_m: f64,
+}
+
+/// Reads the sphere of `scale_mat_0`, in which NeuS and its descendants look for the object.
+///
+/// # Errors
+/// The file is damaged, has no such matrix, or the matrix does not turn the unit sphere into a sphere.
+pub fn read_neus_sphere(path: impl AsRef<Path>) -> Result<ObjectSphere> {
+    let path = path.as_ref();
+    let wrong = |found: String| InputError::new(path, found).at("scale_mat_0".to_owned());
+    let m = read_matrix(&Archive::open(path)?.read("scale_mat_0.npy")?).map_err(wrong)?;
+    let linear: Matrix3<f64> = m.fixed_view::<3, 3>(0, 0).into();
+    let squares = linear.transpose() * linear;
+    let radius_m = (squares.trace() / 3.0).sqrt();
+    let is_sphere = (squares - Matrix3::identity() * radius_m.powi(2)).amax() <= 1e-4 * radius_m.powi(2);
+    if !(m.iter().all(|v| v.is_finite()) && radius_m > 0.0 && is_sphere) {
+        return Err(wrong("turns the unit sphere into something else than a sphere".to_owned()).into());
+    }
+    Ok(ObjectSphere { center: Point3::new(m[(0, 3)], m[(1, 3)], m[(2, 3)]), radius_m })
 }
 
 /// A 4x4 array in NumPy's format.
@@ -157,5 +185,26 @@ mod tests {
         let expected = frame.intrinsics.img_from_cam(&(frame.world_from_cam.inverse() * p_in_world)).unwrap();
         let found = projection * nalgebra::Vector4::new(0.0, 1.0, 0.0, 1.0);
         assert!((found.x / found.z - expected.x).abs() < 1e-9 && (found.y / found.z - expected.y).abs() < 1e-9);
+
+        let sphere = read_neus_sphere(&path).unwrap();
+        assert!((sphere.center - object.center()).norm() < 1e-12 && (sphere.radius_m - radius).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_scale_matrix_that_makes_no_sphere_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("cameras.npz");
+        for (matrix, found) in [
+            (Matrix4::from_diagonal(&nalgebra::Vector4::new(1.0, 2.0, 1.0, 1.0)), "something else than a sphere"),
+            (Matrix4::from_element(f64::NAN), "something else than a sphere"),
+        ] {
+            let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
+            archive.start_file("scale_mat_0.npy", SimpleFileOptions::default()).unwrap();
+            archive.write_all(&npy_bytes(&matrix).unwrap()).unwrap();
+            std::fs::write(&path, archive.finish().unwrap().get_ref()).unwrap();
+            assert!(read_neus_sphere(&path).unwrap_err().to_string().contains(found));
+        }
+        std::fs::write(&path, b"no archive").unwrap();
+        assert!(read_neus_sphere(&path).unwrap_err().to_string().contains("not a readable zip archive"));
     }
 }

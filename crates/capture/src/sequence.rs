@@ -264,6 +264,11 @@ impl Sequence {
         self.root.join("mesh/visible_surface.ply")
     }
 
+    /// Where the cameras for NeuS lie, with the sphere around the object.
+    pub fn neus_cameras_path(&self) -> PathBuf {
+        self.root.join("cameras.npz")
+    }
+
     /// Where the visibility volume lies.
     pub fn visibility_path(&self) -> PathBuf {
         self.root.join("visibility_mask.npy")

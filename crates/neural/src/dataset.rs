@@ -5,7 +5,7 @@
 
 use std::borrow::Cow;
 
-use mb_capture::{Alignment, Frame, FrameId, Sequence};
+use mb_capture::{Alignment, Frame, FrameId, Sequence, read_neus_sphere};
 use mb_geometry::{Camera, ImageSize, Intrinsics, Rigid3, World};
 use mb_image::{Image, RgbImage};
 use mb_job::{InputError, Progress, Result, Rng, Steps};
@@ -224,20 +224,29 @@ impl RayDataset {
                 Ok(view)
             })
             .collect::<Result<_>>()?;
-        let (views, warnings) = drop_blank(views);
-        Self::new(views, warnings).map_err(|found| {
+        let (views, mut warnings) = drop_blank(views);
+        let named = match sequence.neus_cameras_path() {
+            path if !with_masks && path.is_file() => Some(read_neus_sphere(path)?),
+            _ => None,
+        };
+        let region = named.and_then(|sphere| Region::from_sphere(&sphere, &views));
+        if named.is_some() && region.is_none() {
+            warnings
+                .push("most photographs do not show the middle of the sphere of cameras.npz; it was not used".into());
+        }
+        Self::new(views, region, warnings).map_err(|found| {
             InputError::new(sequence.root(), found)
                 .help("Check the poses: OpenCV axes (x right, y down, z forward), camera to world, metres")
                 .into()
         })
     }
 
-    /// From views whose scene frame is not known yet.
-    fn new(mut views: Vec<View>, warnings: Vec<String>) -> std::result::Result<Self, String> {
+    /// From views whose scene frame is not known yet; without a region it is found from the views.
+    fn new(mut views: Vec<View>, region: Option<Region>, warnings: Vec<String>) -> std::result::Result<Self, String> {
         if views.iter().filter(|v| !v.held_out).count() < 2 {
             return Err("fewer than 2 photographs are left for training".to_owned());
         }
-        let region = Region::find(&views)?;
+        let region = region.map_or_else(|| Region::find(&views), Ok)?;
         views.iter_mut().for_each(|view| view.enter(&region));
         let training = (0..views.len()).filter(|i| !views[*i].held_out).collect();
         Ok(Self { views, training, region, warnings })
@@ -263,7 +272,7 @@ impl RayDataset {
                 center: [0.0; 3],
             })
             .collect();
-        Self::new(views, Vec::new()).map_err(mb_job::Error::Failed)
+        Self::new(views, None, Vec::new()).map_err(mb_job::Error::Failed)
     }
 
     /// All views in frame order.

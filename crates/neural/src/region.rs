@@ -1,5 +1,6 @@
 //! The region of interest: a ball around the object, which becomes the unit ball of the scene frame.
 
+use mb_capture::ObjectSphere;
 use mb_geometry::{Aabb, World};
 use nalgebra::{Matrix3, Point2, Point3, Vector3};
 use serde::{Deserialize, Serialize};
@@ -12,6 +13,8 @@ use crate::dataset::View;
 pub enum RegionSource {
     /// The object's masks.
     Masks,
+    /// The sphere of `cameras.npz`, which whoever posed the object drew around it, as NeuS takes it.
+    Sphere,
     /// Where the cameras look, and how much they see.
     Cameras,
 }
@@ -106,6 +109,13 @@ impl Region {
         }
         let source = if masked { RegionSource::Masks } else { RegionSource::Cameras };
         Ok(Self { center, radius_m, source })
+    }
+
+    /// The sphere around the object that a sequence names; `None` where most photographs do not show its centre.
+    pub fn from_sphere(sphere: &ObjectSphere, views: &[View]) -> Option<Self> {
+        let shown = views.iter().filter(|view| shows(view, &sphere.center)).count();
+        let (center, radius_m) = (sphere.center, sphere.radius_m);
+        (2 * shown >= views.len()).then_some(Self { center, radius_m, source: RegionSource::Sphere })
     }
 
     /// A world point in the scene frame.

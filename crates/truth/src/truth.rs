@@ -147,7 +147,7 @@ pub fn truth(sequence: &Sequence, options: &TruthOptions, progress: &dyn Progres
     mb_mesh::write_ply(sequence.gt_mesh_path(), &gt_mesh)?;
     mb_mesh::write_ply(sequence.visible_surface_path(), &visible)?;
     volume.write(sequence.visibility_path())?;
-    write_neus_cameras(sequence.root().join("cameras.npz"), &exact.frames, &bounds_in_world)?;
+    write_neus_cameras(sequence.neus_cameras_path(), &exact.frames, &bounds_in_world)?;
 
     let mut warnings = Vec::new();
     if !frames_without_model.is_empty() {

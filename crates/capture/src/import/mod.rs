@@ -5,7 +5,7 @@
 //! frames, undistortion, writing) is common to all and lies in `write`. Nothing is dropped in silence: frames that
 //! cannot be used are listed with the reason.
 
-mod archive;
+pub(crate) mod archive;
 mod arkit_json;
 mod arkit_scenes;
 mod axes;
