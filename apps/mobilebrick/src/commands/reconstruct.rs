@@ -113,7 +113,8 @@ impl Tsdf {
 /// What all trained fields share.
 #[derive(Debug, Args)]
 pub struct FieldTraining {
-    /// `fast` is made for a processor; `paper` has the published sizes and steps, which take days there
+    /// `fast` is made for a processor; `paper` has the published sizes and steps, which take days there; `best` (neus
+    /// only) is finer and several times slower than `fast`
     #[arg(long, value_name = "PRESET", default_value = "fast", value_parser = FieldOptions::PRESETS, conflicts_with = "options")]
     preset: String,
 
@@ -168,8 +169,9 @@ impl FieldTraining {
     pub fn options(&self, method: &str, out: &Path) -> Result<FieldOptions> {
         let mut options = match &self.options {
             Some(file) => read_options(file, method)?,
-            None => FieldOptions::preset(method, &self.preset, self.seed.seed)
-                .ok_or_else(|| Error::Failed(format!("{method} has no preset `{}`", self.preset)))?,
+            None => FieldOptions::preset(method, &self.preset, self.seed.seed).ok_or_else(|| {
+                Error::Failed(format!("{method} has no preset `{}`: take fast or paper", self.preset))
+            })?,
         };
         if let Some(iterations) = self.iterations {
             options = options.with_iterations(iterations);
