@@ -4,6 +4,7 @@
 //! also on failure; logs and progress go to stderr.
 
 mod commands;
+mod memory;
 mod outcome;
 mod terminal;
 

@@ -148,6 +148,7 @@ impl Surface {
         if let Some(method) = self.method {
             let list = self.list.read()?;
             let predictions = self.meshes.join(&method);
+            crate::memory::keep_freed();
             let table = evaluate_surface_method(&method, &predictions, &self.root, &list, &options, terminal)?;
             let out = self.out.unwrap_or(predictions);
             table.write(&out)?;
