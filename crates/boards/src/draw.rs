@@ -60,10 +60,10 @@ impl BoardSpec {
         black
     }
 
-    /// Size of [`BoardSpec::texture`].
+    /// Size of [`BoardSpec::texture`]: whole pixels, enough for all of the board and its margins.
     pub fn texture_size(&self, dots_per_inch: f64, margin_m: f64) -> ImageSize {
         let [width, height] =
-            self.size_m().map(|m| (((m + 2.0 * margin_m) * dots_per_inch / INCH_M).round() as usize).max(1));
+            self.size_m().map(|m| (snap((m + 2.0 * margin_m) * dots_per_inch / INCH_M).ceil() as usize).max(1));
         ImageSize::new(width, height)
     }
 
@@ -101,10 +101,13 @@ impl BoardSpec {
     }
 }
 
+/// Lengths in metres times a scale are whole numbers of pixels only up to rounding.
+fn snap(pixels: f64) -> f64 {
+    if (pixels - pixels.round()).abs() < 1e-6 { pixels.round() } else { pixels }
+}
+
 /// The pixels of a row of `count` that the interval from `start` covers, and how much of each.
 fn shares(start: f64, length: f64, count: usize) -> Vec<(usize, f32)> {
-    // Lengths in metres times a scale are whole numbers only up to rounding.
-    let snap = |v: f64| if (v - v.round()).abs() < 1e-6 { v.round() } else { v };
     let (start, end) = (snap(start).clamp(0.0, count as f64), snap(start + length).clamp(0.0, count as f64));
     (start.floor() as usize..end.ceil() as usize)
         .map(|i| (i, (end.min(i as f64 + 1.0) - start.max(i as f64)) as f32))
