@@ -291,7 +291,8 @@ impl Learner for GpuDvgo {
         self.learn(&rays, count, step);
         let losses: Vec<[f32; 2]> = self.context.read(&self.losses, count)?;
         let mean = |i: usize| losses.iter().map(|l| f64::from(l[i])).sum::<f64>() / count as f64;
-        Ok(StepReport { loss: mean(1), mse: mean(0) / 3.0, rays: count, samples: self.marched.len })
+        let (samples, lit) = (self.marched.len, self.bright.len);
+        Ok(StepReport { loss: mean(1), mse: mean(0) / 3.0, rays: count, samples, lit })
     }
 
     fn fetch(&mut self) -> Result<()> {

@@ -108,7 +108,6 @@ fn unsupported(options: &FieldOptions) -> Option<&'static str> {
         Method::Neus(neus) if !hashed(neus.field.position) => {
             Some("a GPU trains neus with frequencies only as published, with the preset paper")
         }
-        Method::Neus(neus) if neus.exposure => Some("a GPU cannot learn the exposure of photographs (preset best) yet"),
         Method::NeusOriginal(neus) if hashed(neus.field.position) => {
             Some("a GPU trains neus on a hash encoding only with the preset fast")
         }

@@ -139,7 +139,7 @@ impl Learner for GpuNerf {
         if (step + 1).is_multiple_of(every) {
             self.refresh_occupancy((step + 1) / every)?;
         }
-        Ok(StepReport { loss, mse, rays: count, samples: self.samples.len })
+        Ok(StepReport { loss, mse, rays: count, samples: self.samples.len, lit: self.samples.len })
     }
 
     fn fetch(&mut self) -> Result<()> {

@@ -190,7 +190,8 @@ impl Learner for GpuNerfOriginal {
         }
         work.submit();
         let [coarse_mse, mse] = sums.map(|sum| sum / (3 * count) as f64);
-        Ok(StepReport { loss: coarse_mse + mse, mse, rays: count, samples: count * (2 * coarse + fine) })
+        let samples = count * (2 * coarse + fine);
+        Ok(StepReport { loss: coarse_mse + mse, mse, rays: count, samples, lit: samples })
     }
 
     fn fetch(&mut self) -> Result<()> {

@@ -139,6 +139,7 @@ impl GpuNeus {
             out.forward(&mut work, k, rays, &self.outer);
         }
         let samples = count as f32 * twin.samples_per_ray[0].max(1.0);
+        let eikonal = twin.eikonal_weight(step);
         let mut sizes = vec![count as u32];
         sizes.extend(
             [
@@ -146,8 +147,8 @@ impl GpuNeus {
                 twin.sharpness(),
                 twin.anneal(step),
                 o.mask,
-                o.eikonal / samples,
-                o.eikonal / free as f32,
+                eikonal / samples,
+                eikonal / free as f32,
                 DARK,
             ]
             .map(f32::to_bits),
@@ -235,7 +236,7 @@ impl Learner for GpuNeus {
         if (step + 1).is_multiple_of(every) {
             self.refresh_cells((step + 1) / every)?;
         }
-        Ok(StepReport { loss, mse, rays: count, samples: self.marched.len })
+        Ok(StepReport { loss, mse, rays: count, samples: self.marched.len, lit: self.inner.len })
     }
 
     fn fetch(&mut self) -> Result<()> {

@@ -293,7 +293,8 @@ impl Learner for GpuNeusOriginal {
         let o = &self.twin.options;
         let lr = o.learning_rate * o.schedule.factor(step);
         self.twin.step_sharpness(sum(2) as f32, lr, step + 1);
-        Ok(StepReport { loss, mse, rays: count, samples: count * n + drawn.outside.len() })
+        let samples = count * n + drawn.outside.len();
+        Ok(StepReport { loss, mse, rays: count, samples, lit: samples })
     }
 
     fn fetch(&mut self) -> Result<()> {

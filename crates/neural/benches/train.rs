@@ -1,6 +1,7 @@
 //! Trains a method on a sequence and prints its curve: `cargo bench -p mb-neural --bench train -- SEQ METHOD STEPS
-//! MAX_SIDE_PX OUT [OPTIONS]`. Every twentieth of the run: wall and CPU seconds, PSNR of the training rays, and PSNR of
-//! the held-out views on every 61st pixel (its time is not counted). At the end the held-out views in full, each
+//! MAX_SIDE_PX OUT [OPTIONS]`. Every twentieth of the run: wall and CPU seconds, PSNR of the training rays, PSNR of the
+//! held-out views on every 61st pixel (its time is not counted), and what a step took on average since the row before
+//! (`pytorch_methods.py` beside this file takes as many rays and samples; light reaches the lit ones). At the end the held-out views in full, each
 //! written to OUT beside its photograph. OPTIONS is JSON that replaces options of the preset, such as
 //! `{"samples_per_step": 32768}`; `"cameras"` and `"data"` in it replace those.
 
@@ -78,7 +79,7 @@ fn main() {
     let mut cameras = CameraResiduals::new(&options.cameras, &data);
     println!("{} parameters, {} MiB", model.parameter_count(), (model.bytes() + data.bytes()) >> 20);
     let (mut wall, mut cpu) = (0.0, 0.0);
-    let (mut mse, mut rays, mut samples, mut all_samples) = (0.0, 0, 0, 0);
+    let (mut mse, mut rays, mut samples, mut lit, mut before) = (0.0, 0, 0, 0, (0.0, 0.0));
     let every = (steps / 20).max(1);
     for step in 0..steps {
         let (clock, cpu_clock) = (Instant::now(), ProcessTime::now());
@@ -88,20 +89,23 @@ fn main() {
         mse += report.mse;
         rays += report.rays;
         samples += report.samples;
-        all_samples += report.samples;
+        lit += report.lit;
         if (step + 1).is_multiple_of(every) {
             println!(
                 "step {:6}  {wall:6.1} s wall {cpu:6.1} s CPU  train {:.2} dB  held out {:.2} dB  loss {:.5}  \
-                 {:.1} samples/ray  {:.0} k samples/CPU s  cameras {:?}",
+                 a step: {} rays, {} samples, {} lit, {:.4} CPU s, {:.4} wall s  cameras {:?}",
                 step + 1,
                 psnr_db(mse / every as f64),
                 quick_psnr_db(model.as_ref(), &data, &cameras),
                 report.loss,
-                samples as f64 / rays as f64,
-                all_samples as f64 / cpu / 1e3,
+                rays as u64 / every,
+                samples as u64 / every,
+                lit as u64 / every,
+                (cpu - before.1) / every as f64,
+                (wall - before.0) / every as f64,
                 cameras.size(),
             );
-            (mse, rays, samples) = (0.0, 0, 0);
+            (mse, rays, samples, lit, before) = (0.0, 0, 0, 0, (wall, cpu));
         }
     }
     let mut sum = 0.0;

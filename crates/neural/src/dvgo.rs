@@ -202,6 +202,7 @@ struct Group {
     loss: f64,
     squared: f64,
     marched: usize,
+    lit: usize,
 }
 
 /// A DVGO in training. The fields and parameters are those of the stage that it is in. Its state is open, for a device
@@ -378,7 +379,8 @@ impl Dvgo {
     ) {
         let rays = self.rays_of_group();
         data.draw(rng, rays, cameras, &mut group.rays);
-        (group.loss, group.squared, group.marched) = (0.0, 0.0, 0);
+        (group.loss, group.squared) = (0.0, 0.0);
+        (group.marched, group.lit) = (0, 0);
         group.gradients.clear();
         let mut next = 0;
         while next < group.rays.len() {
@@ -392,6 +394,7 @@ impl Dvgo {
             }
             group.marched += group.tile.samples.len();
             self.shade(&mut group.tile, &mut group.field, &group.backgrounds);
+            group.lit += group.tile.samples.len();
             self.losses(group, first..next, 1.0 / (rays * GROUPS) as f32);
             let Group { field: worker, tile: Tile { samples, .. }, gradients, rays, .. } = &mut *group;
             self.field.backward(&self.parameters, transposed, &samples.positions, worker);
@@ -616,6 +619,7 @@ impl Model for Dvgo {
             mse: groups.iter().map(|g| g.squared).sum::<f64>() / (3 * rays) as f64,
             rays,
             samples: groups.iter().map(|g| g.marched).sum(),
+            lit: groups.iter().map(|g| g.lit).sum(),
         };
         self.groups = groups;
         Ok(report)

@@ -16,19 +16,19 @@
 //!
 //! The layers, from below:
 //! - kernels: [`simd`] (one matrix product, dispatched at run time), [`mlp`], [`hash_grid`], [`dense_grid`],
-//!   [`encoding`], [`ray_samples`], [`composite`], [`neus_alpha`], [`sampling`], [`adam`]. Derivatives are derived by hand; each module
-//!   states its equations, and its tests hold them to finite differences.
+//!   [`encoding`], [`ray_samples`], [`composite`], [`neus_alpha`], [`sampling`], [`adam`]. Derivatives are derived by hand;
+//!   each module states its equations, and its tests hold them to finite differences.
 //! - fields: [`radiance_field`] (density and colour on a hash grid), [`voxel_field`] (the same on voxels),
 //!   [`frequency_field`] (the same in one deep network), [`sdf_field`] (distance, exact normals, colour).
 //! - methods: [`nerf`], [`dvgo`], [`neus`] for a processor, [`nerf_original`] and [`neus_original`] as published, all behind
-//!   [`model::Model`]; [`dataset`] gives them rays, [`cameras`] corrects these and [`exposure`] their colours, [`trainer`] runs them, [`extract`] takes
+//!   [`model::Model`]; [`dataset`] gives them rays, [`cameras`] corrects these, [`trainer`] runs them, [`extract`] takes
 //!   the surface, [`camera_path`] says what to render, [`results`] writes what lies beside a result.
 //!
 //! A step is cut into a fixed number of groups of rays. Each has its own random numbers, and their sums are added in
 //! order, so a run's result depends on the seed and the machine's instruction set, not on the number of threads.
 //!
-//! Limits: pinhole cameras without distortion (imports take it out); one exposure for all photographs but in `neus` `best`; the GPU path is another crate's,
-//! which fills [`device::Device`].
+//! Limits: pinhole cameras without distortion (imports take it out); one exposure for all photographs; the GPU path is
+//! another crate's, which fills [`device::Device`].
 
 #![allow(clippy::too_many_arguments, reason = "kernels take buffers with their strides")]
 
@@ -43,7 +43,6 @@ pub mod dense_grid;
 pub mod device;
 pub mod dvgo;
 pub mod encoding;
-pub mod exposure;
 pub mod extract;
 pub mod frequency_field;
 pub mod hash_grid;

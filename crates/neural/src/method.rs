@@ -74,9 +74,8 @@ impl FieldOptions {
     /// The names that [`FieldOptions::preset`] knows.
     pub const METHODS: [&'static str; 3] = ["nerf", "dvgo", "neus"];
 
-    /// The names that it knows of their presets: small enough for a processor, as published, and the best that we know
-    /// (`neus` only).
-    pub const PRESETS: [&'static str; 3] = ["fast", "paper", "best"];
+    /// The names that it knows of their presets: small enough for a processor, and as published.
+    pub const PRESETS: [&'static str; 2] = ["fast", "paper"];
 
     /// The options of a method in a preset; `None` for other names.
     pub fn preset(method: &str, preset: &str, seed: u64) -> Option<Self> {
@@ -86,7 +85,6 @@ impl FieldOptions {
             ("dvgo", "fast") => Method::Dvgo(DvgoOptions { seed, ..DvgoOptions::fast() }),
             ("dvgo", "paper") => Method::Dvgo(DvgoOptions { seed, ..DvgoOptions::paper() }),
             ("neus", "fast") => Method::Neus(NeusOptions { seed, ..NeusOptions::default() }),
-            ("neus", "best") => Method::Neus(NeusOptions { seed, ..NeusOptions::best() }),
             ("neus", "paper") => Method::NeusOriginal(NeusOriginalOptions { seed, ..NeusOriginalOptions::paper() }),
             _ => return None,
         };

@@ -16,6 +16,8 @@ pub struct StepReport {
     pub rays: usize,
     /// Samples of the step.
     pub samples: usize,
+    /// Of them, those that light reached: only they get colours and derivatives.
+    pub lit: usize,
 }
 
 /// Where a method's surface is: the level set of a function.

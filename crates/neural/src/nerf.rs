@@ -116,6 +116,7 @@ struct Group {
     loss: f64,
     distortion: f64,
     marched: usize,
+    lit: usize,
 }
 
 /// What a step asks of its groups.
@@ -232,7 +233,8 @@ impl Nerf {
     fn run_group(&self, task: &Task<'_>, rng: &mut Rng, group: &mut Group) {
         let scale = 1.0 / (3 * task.rays * GROUPS) as f32;
         task.data.draw(rng, task.rays, task.cameras, &mut group.rays);
-        (group.loss, group.distortion, group.marched) = (0.0, 0.0, 0);
+        (group.loss, group.distortion) = (0.0, 0.0);
+        (group.marched, group.lit) = (0, 0);
         group.gradients.clear();
         let mut next = 0;
         while next < group.rays.len() {
@@ -247,6 +249,7 @@ impl Nerf {
             }
             group.marched += group.tile.samples.len();
             self.shade(&mut group.tile, &mut group.field, &group.backgrounds, Some(&mut group.seen));
+            group.lit += group.tile.samples.len();
             self.losses(group, first..next, scale);
             let Group { field: worker, tile: Tile { samples, .. }, rays, gradients, .. } = &mut *group;
             self.field.backward(&self.parameters, task.transposed, &samples.positions, worker);
@@ -361,6 +364,7 @@ impl Model for Nerf {
         let mse = groups.iter().map(|g| g.loss).sum::<f64>() / (3.0 * n);
         let distortion = groups.iter().map(|g| g.distortion).sum::<f64>() / n;
         let samples = groups.iter().map(|g| g.marched).sum::<usize>();
+        let lit = groups.iter().map(|g| g.lit).sum();
         for group in &mut groups {
             self.occupancy.raise(&group.seen);
             group.seen.clear();
@@ -372,7 +376,7 @@ impl Model for Nerf {
             self.refresh_occupancy((step + 1) / self.options.occupancy_every);
         }
         let loss = mse + f64::from(self.options.distortion) * distortion;
-        Ok(StepReport { loss, mse, rays: rays * GROUPS, samples })
+        Ok(StepReport { loss, mse, rays: rays * GROUPS, samples, lit })
     }
 
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {

@@ -384,7 +384,7 @@ impl Model for NerfOriginal {
         let (loss, mse) = (mean(|g| g.loss), mean(|g| g.squared));
         self.groups = groups;
         let samples = rays * (2 * self.options.coarse_samples + self.options.fine_samples);
-        Ok(StepReport { loss, mse, rays, samples })
+        Ok(StepReport { loss, mse, rays, samples, lit: samples })
     }
 
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {

@@ -21,7 +21,6 @@ use crate::cameras::{CameraResiduals, RayGradient};
 use crate::composite::{CompositeGradient, RayComposites, opacity};
 use crate::contraction::{contract, contract_gradient};
 use crate::dataset::{RayDataset, SceneRay, TargetRay};
-use crate::exposure::Exposures;
 use crate::hash_grid::HashGridOptions;
 use crate::model::{GROUPS, Level, Model, StepReport, TILE, same_lengths};
 use crate::neus_alpha::Section;
@@ -57,10 +56,13 @@ pub struct NeusOptions {
     pub initial_sharpness: f32,
     /// Steps until rays must face the surface (NeuS: 50,000 of 300,000).
     pub anneal: u64,
-    /// Weight of the eikonal loss (NeuS: 0.1).
+    /// Weight of the eikonal loss (NeuS: 0.1, over samples all along the rays; here they are those near the surface). With
+    /// 0.1 to the end the surface stays a skin over gaps and windows, painted with what lies behind.
     pub eikonal: f32,
-    /// Learn the exposure and white balance of each photograph.
-    pub exposure: bool,
+    /// The same at the start, until the shape has settled.
+    pub first_eikonal: f32,
+    /// Steps in which it falls from the one to the other.
+    pub settle: u64,
     /// Learn only what the masks show, where there are masks.
     pub use_masks: bool,
     /// Weight of the mask loss (NeuS: 0.1 with masks).
@@ -107,7 +109,7 @@ impl Default for NeusOptions {
                 features: 15,
                 softplus: 100.0,
                 color_width: 64,
-                color_hidden: 2,
+                color_hidden: 1,
                 weight_norm: false,
                 initial_radius: 0.5,
             },
@@ -122,8 +124,9 @@ impl Default for NeusOptions {
             schedule: Schedule::WarmExponential { warm_up: 100, end: iterations, floor: 0.03 },
             initial_sharpness: 0.3,
             anneal: iterations / 6,
-            eikonal: 0.1,
-            exposure: false,
+            eikonal: 0.002,
+            first_eikonal: 0.1,
+            settle: iterations / 16,
             use_masks: true,
             mask: 0.1,
             first_levels: 3,
@@ -140,25 +143,13 @@ impl Default for NeusOptions {
 }
 
 impl NeusOptions {
-    /// The preset `best`: finer cells, shorter steps and twice as many of them as `fast`, and the exposure of each photograph.
-    pub fn best() -> Self {
-        let mut options = Self { exposure: true, shortest_step: 0.004, ..Self::default() };
-        options.field.position = PositionEncoding::Hash(HashGridOptions {
-            levels: 10,
-            features: 4,
-            log2_entries: 18,
-            coarsest: 16,
-            finest: 1024,
-        });
-        options.with_iterations(12_000)
-    }
-
     /// The same with another number of steps: everything that is counted in steps follows.
     #[must_use]
     pub fn with_iterations(mut self, iterations: u64) -> Self {
         self.iterations = iterations;
         self.schedule = Schedule::WarmExponential { warm_up: 100.min(iterations / 10), end: iterations, floor: 0.03 };
         self.anneal = iterations / 6;
+        self.settle = iterations / 16;
         self.level_every = (iterations / 12).max(1);
         self
     }
@@ -194,11 +185,10 @@ struct Group {
     /// Cells of the background that were sampled, and the density found.
     seen: Vec<(u32, f32)>,
     d_cosines: Vec<f32>,
-    /// Views of the rays, with what the loss asks of their exposures.
-    d_exposures: Vec<(u32, [f32; 3])>,
     loss: f64,
     squared: f64,
     marched: usize,
+    lit: usize,
     d_sharpness: f32,
 }
 
@@ -225,8 +215,6 @@ pub struct Neus {
     pub outside_parameters: RadianceParameters,
     /// v, with sharpness s = exp(10 v).
     pub sharpness: Parameters,
-    /// Gains of the photographs.
-    pub exposures: Exposures,
     /// Where the surface may be, in the ball.
     pub inner_cells: OccupancyGrid,
     /// Where matter may be, in contracted space.
@@ -258,7 +246,6 @@ impl Neus {
         let mut neus = Self {
             outside_parameters: outside.init(&mut rng),
             sharpness: Parameters::new(vec![options.initial_sharpness]),
-            exposures: Exposures::new(options.exposure, data),
             inner_cells: OccupancyGrid::new(options.occupancy),
             outer_cells,
             samples_per_ray: vec![64.0],
@@ -292,6 +279,13 @@ impl Neus {
     /// How far rays must face the surface: r of [`crate::neus_alpha`].
     pub fn anneal(&self, step: u64) -> f32 {
         if self.options.anneal == 0 { 1.0 } else { (step as f32 / self.options.anneal as f32).min(1.0) }
+    }
+
+    /// Weight of the eikonal loss: from the first to the last in equal factors.
+    pub fn eikonal_weight(&self, step: u64) -> f32 {
+        let o = &self.options;
+        let settled = (step as f32 / o.settle.max(1) as f32).min(1.0);
+        o.first_eikonal.powf(1.0 - settled) * o.eikonal.powf(settled)
     }
 
     /// Distance from the surface within which a cell of the inner grid counts.
@@ -395,11 +389,11 @@ impl Neus {
     }
 
     fn run_group(&self, task: &Task<'_>, rng: &mut Rng, group: &mut Group) {
-        let (rays, anneal) = (task.rays, self.anneal(task.step));
+        let (rays, anneal, eikonal_weight) = (task.rays, self.anneal(task.step), self.eikonal_weight(task.step));
         task.data.draw(rng, rays, task.cameras, &mut group.rays);
-        (group.loss, group.squared, group.marched, group.d_sharpness) = (0.0, 0.0, 0, 0.0);
+        (group.loss, group.squared, group.d_sharpness) = (0.0, 0.0, 0.0);
+        (group.marched, group.lit) = (0, 0);
         group.gradients.clear();
-        group.d_exposures.clear();
         let mut next = 0;
         while next < group.rays.len() {
             let first = next;
@@ -414,10 +408,11 @@ impl Neus {
             group.marched += group.tile.inner.len();
             let Group { sdf, outside, tile, backgrounds, seen, .. } = group;
             self.shade(tile, sdf, outside, backgrounds, anneal);
+            group.lit += tile.inner.len();
             let cells = tile.outer.positions.iter().map(|u| self.outer_cells.cell(*u) as u32);
             seen.extend(cells.zip(outside.sigma.iter().copied()));
             self.losses(group, first..next, rays);
-            self.send_back(group, anneal, rays);
+            self.send_back(group, anneal, eikonal_weight, rays);
             if !self.with_masks {
                 let Group { outside, tile, .. } = &mut *group;
                 self.outside.backward(&self.outside_parameters, task.transposed, &tile.outer.positions, outside);
@@ -427,7 +422,7 @@ impl Neus {
                 self.ray_gradients(group, first..next);
             }
         }
-        self.free_points(rng, group);
+        self.free_points(rng, eikonal_weight, group);
     }
 
     /// What the losses ask of the tile's rays: through the samples' positions (their distances stay), the encoded
@@ -462,22 +457,21 @@ impl Neus {
             let found = shown.rays[i];
             let mask = target.mask.filter(|_| self.with_masks);
             let wanted = target.rgb.map(|c| c * mask.unwrap_or(1.0));
-            let gain = self.exposures.gain(target.view);
-            let error: [f32; 3] = std::array::from_fn(|c| gain[c] * found.rgb[c] - wanted[c]);
+            let error: [f32; 3] = std::array::from_fn(|c| found.rgb[c] - wanted[c]);
             group.squared += error.iter().map(|e| f64::from(e * e)).sum::<f64>();
             group.loss += error.iter().map(|e| f64::from(e.abs())).sum::<f64>() / 3.0;
             let (loss, pull) = mask.map_or((0.0, 0.0), |mask| mask_loss(found.transmittance, mask));
             group.loss += f64::from(self.options.mask * loss);
-            let d_rgb: [f32; 3] = std::array::from_fn(|c| error[c].signum() * scale / 3.0 * gain[c]);
-            if self.options.exposure {
-                group.d_exposures.push((target.view, std::array::from_fn(|c| d_rgb[c] * found.rgb[c])));
-            }
-            shown.send_back(i, &CompositeGradient { d_rgb, d_transmittance: self.options.mask * scale * pull });
+            let gradient = CompositeGradient {
+                d_rgb: error.map(|e| e.signum() * scale / 3.0),
+                d_transmittance: self.options.mask * scale * pull,
+            };
+            shown.send_back(i, &gradient);
         }
     }
 
     /// From opacities and colours back to distance, normal, sharpness, density; adds the eikonal loss.
-    fn send_back(&self, group: &mut Group, anneal: f32, rays: usize) {
+    fn send_back(&self, group: &mut Group, anneal: f32, eikonal_weight: f32, rays: usize) {
         let s = self.sharpness();
         let Group { sdf, outside, tile: Tile { inner, outer, shown }, d_cosines, .. } = group;
         d_cosines.clear();
@@ -495,7 +489,7 @@ impl Neus {
                 let d_alpha = shown.d_alphas[at];
                 sdf.d_sdf.push(d_alpha * derivative.sdf);
                 group.d_sharpness += d_alpha * derivative.sharpness;
-                let (loss, pull) = eikonal(sdf.normals[i], self.options.eikonal / samples);
+                let (loss, pull) = eikonal(sdf.normals[i], eikonal_weight / samples);
                 group.loss += f64::from(loss) * (rays * GROUPS) as f64;
                 let d_cosine = d_alpha * derivative.cosine;
                 sdf.d_normals.push(std::array::from_fn(|d| d_cosine * direction[d] + pull[d]));
@@ -512,13 +506,13 @@ impl Neus {
     }
 
     /// The eikonal loss at random points of the ball.
-    fn free_points(&self, rng: &mut Rng, group: &mut Group) {
+    fn free_points(&self, rng: &mut Rng, eikonal_weight: f32, group: &mut Group) {
         let points: Vec<[f32; 3]> =
             (0..FREE_POINTS).map(|_| std::array::from_fn(|_| rng.random_range(-1.0..1.0f32))).collect();
         let sdf = &mut group.sdf;
         self.field.distance(&points, sdf);
         self.field.normals(sdf);
-        let weight = self.options.eikonal / (FREE_POINTS * GROUPS) as f32;
+        let weight = eikonal_weight / (FREE_POINTS * GROUPS) as f32;
         sdf.d_normals.clear();
         sdf.d_normals.extend(sdf.normals.iter().map(|n| eikonal(*n, weight).1));
         sdf.d_sdf.clear();
@@ -642,10 +636,8 @@ impl Model for Neus {
         let loss = groups.iter().map(|g| g.loss).sum::<f64>() / n;
         let mse = groups.iter().map(|g| g.squared).sum::<f64>() / (3.0 * n);
         let samples = groups.iter().map(|g| g.marched).sum::<usize>();
+        let lit = groups.iter().map(|g| g.lit).sum();
         let d_sharpness = groups.iter().map(|g| g.d_sharpness).sum();
-        for (view, gradient) in groups.iter().flat_map(|g| &g.d_exposures) {
-            self.exposures.add(*view, *gradient);
-        }
         for group in &mut groups {
             self.outer_cells.raise(&group.seen);
             group.seen.clear();
@@ -655,7 +647,6 @@ impl Model for Neus {
         let (table, network) = (self.options.table_learning_rate * factor, self.options.learning_rate * factor);
         self.field.step(&ADAM, table, network, step + 1);
         self.step_sharpness(d_sharpness, step + 1);
-        self.exposures.step(data, network, step + 1);
         if !self.with_masks {
             self.outside_parameters.step(table, step + 1);
         }
@@ -663,7 +654,7 @@ impl Model for Neus {
         if (step + 1).is_multiple_of(self.options.occupancy_every) {
             self.refresh_cells((step + 1) / self.options.occupancy_every);
         }
-        Ok(StepReport { loss, mse, rays: rays * GROUPS, samples })
+        Ok(StepReport { loss, mse, rays: rays * GROUPS, samples, lit })
     }
 
     fn render(&self, rays: &[SceneRay]) -> Vec<[f32; 3]> {
@@ -711,9 +702,7 @@ impl Model for Neus {
     fn buffers(&mut self) -> Vec<&mut Vec<f32>> {
         let mut all = self.field.buffers();
         all.extend(self.outside_parameters.buffers());
-        for single in [&mut self.sharpness, &mut self.exposures.logarithms] {
-            all.extend([&mut single.values, &mut single.m, &mut single.v]);
-        }
+        all.extend([&mut self.sharpness.values, &mut self.sharpness.m, &mut self.sharpness.v]);
         all.extend(self.inner_cells.buffers());
         all.extend(self.outer_cells.buffers());
         all.push(&mut self.samples_per_ray);
@@ -724,7 +713,6 @@ impl Model for Neus {
         let mut lengths = self.field.lengths();
         lengths.extend(self.outside_parameters.lengths());
         lengths.extend([1, 1, 1]);
-        lengths.extend([self.exposures.logarithms.grads.len(); 3]);
         lengths.extend(self.inner_cells.lengths());
         lengths.extend(self.outer_cells.lengths());
         lengths.push(1);
@@ -737,8 +725,7 @@ impl Model for Neus {
     }
 
     fn is_finite(&self) -> bool {
-        let small = self.sharpness.is_finite() && self.exposures.logarithms.is_finite();
-        small && self.field.is_finite() && self.outside_parameters.is_finite()
+        self.field.is_finite() && self.outside_parameters.is_finite() && self.sharpness.is_finite()
     }
 
     fn parameter_count(&self) -> usize {

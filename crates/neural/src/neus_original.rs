@@ -512,11 +512,13 @@ impl Model for NeusOriginal {
             self.outside_parameters.step(&ADAM, lr, step + 1);
         }
         let rays = groups.iter().map(|g| g.rays.len()).sum::<usize>();
+        let samples = groups.iter().map(|g| g.samples).sum();
         let report = StepReport {
             loss: groups.iter().map(|g| g.loss).sum::<f64>() / rays as f64,
             mse: groups.iter().map(|g| g.squared).sum::<f64>() / (3 * rays) as f64,
             rays,
-            samples: groups.iter().map(|g| g.samples).sum(),
+            samples,
+            lit: samples,
         };
         self.groups = groups;
         Ok(report)

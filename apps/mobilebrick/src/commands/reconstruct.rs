@@ -113,8 +113,7 @@ impl Tsdf {
 /// What all trained fields share.
 #[derive(Debug, Args)]
 pub struct FieldTraining {
-    /// `fast` is made for a processor; `paper` has the published sizes and steps, which take days there; `best` (neus
-    /// only) is finer and several times slower than `fast`
+    /// `fast` is made for a processor; `paper` has the published sizes and steps, which take days there
     #[arg(long, value_name = "PRESET", default_value = "fast", value_parser = FieldOptions::PRESETS, conflicts_with = "options")]
     preset: String,
 
