@@ -225,6 +225,20 @@ impl RayDataset {
             })
             .collect::<Result<_>>()?;
         let (views, mut warnings) = drop_blank(views);
+        let training = views.iter().filter(|v| !v.held_out).count();
+        if training < MIN_TRAINING {
+            let blank = frames.len() - views.len();
+            return Err(InputError::new(
+                sequence.root().join("image"),
+                format!(
+                    "{blank} of {} photographs are all black or over-exposed; {training} are left for training, at least \
+                     {MIN_TRAINING} are needed",
+                    frames.len()
+                ),
+            )
+            .help("Film the object again with the exposure set for it")
+            .into());
+        }
         let named = match sequence.neus_cameras_path() {
             path if !with_masks && path.is_file() => Some(read_neus_sphere(path)?),
             _ => None,
@@ -243,8 +257,8 @@ impl RayDataset {
 
     /// From views whose scene frame is not known yet; without a region it is found from the views.
     fn new(mut views: Vec<View>, region: Option<Region>, warnings: Vec<String>) -> std::result::Result<Self, String> {
-        if views.iter().filter(|v| !v.held_out).count() < 2 {
-            return Err("fewer than 2 photographs are left for training".to_owned());
+        if views.iter().filter(|v| !v.held_out).count() < MIN_TRAINING {
+            return Err(format!("fewer than {MIN_TRAINING} photographs are left for training"));
         }
         let region = region.map_or_else(|| Region::find(&views), Ok)?;
         views.iter_mut().for_each(|view| view.enter(&region));
@@ -414,6 +428,9 @@ fn read_view(sequence: &Sequence, frame: &Frame, max_side_px: usize, with_mask: 
         center: [0.0; 3],
     })
 }
+
+/// Fewest photographs that can be trained on: one says nothing of depth.
+const MIN_TRAINING: usize = 2;
 
 /// Leaves out photographs that show nothing, and says so.
 fn drop_blank(views: Vec<View>) -> (Vec<View>, Vec<String>) {

@@ -5,7 +5,7 @@ use mb_image::Image;
 use mb_job::{Error, Progress, Silent};
 use mb_neural::camera_path::CameraPath;
 use mb_neural::cameras::{CameraOptions, CameraResiduals};
-use mb_neural::dataset::{Photograph, RayDataset};
+use mb_neural::dataset::{DataOptions, Photograph, RayDataset};
 use mb_neural::device::Processor;
 use mb_neural::dvgo::{Dvgo, DvgoOptions};
 use mb_neural::extract::{SurfaceOptions, extract};
@@ -346,18 +346,38 @@ fn a_run_that_loses_control_is_told_and_gives_no_result() {
     assert!(error.contains("diverged"), "{error}");
 }
 
-#[test]
-fn a_sequence_on_disk_becomes_a_mesh_and_pictures() {
-    let dir = tempfile::tempdir().expect("a folder");
-    let root = dir.path().join("ball");
-    for (i, (rgb, mask, intrinsics, pose)) in photographs(9, ball(0.06)).into_iter().enumerate() {
+fn written(photographs: Vec<Photograph>, root: &std::path::Path) -> mb_capture::Sequence {
+    for (i, (rgb, mask, intrinsics, pose)) in photographs.into_iter().enumerate() {
         mb_image::write_rgb_png(root.join(format!("image/{i:06}.png")), &rgb).expect("written");
         let mask = mask.expect("photographs have masks").map(|m| *m >= 128);
         mb_image::write_mask_png(root.join(format!("mask/{i:06}.png")), &mask).expect("written");
         mb_capture::write_pose_txt(root.join(format!("pose/{i:06}.txt")), &pose).expect("written");
         mb_capture::write_intrinsics_txt(root.join(format!("intrinsic/{i:06}.txt")), &intrinsics).expect("written");
     }
-    let sequence = mb_capture::Sequence::open(&root).expect("a sequence");
+    mb_capture::Sequence::open(root).expect("a sequence")
+}
+
+#[test]
+fn photographs_that_show_nothing_are_left_out_and_named() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let mut views = photographs(6, ball(0.06));
+    (views[1].0, views[4].0) = (Image::filled(SIZE, [0; 3]), Image::filled(SIZE, [255; 3]));
+    let options = DataOptions { hold_out_every: 0, ..DataOptions::default() };
+    let some = written(views.clone(), &dir.path().join("some"));
+    let data = RayDataset::open(&some, &options, &Silent).expect("four good views");
+    assert_eq!(data.views().len(), 4);
+    assert!(data.warnings()[0].contains("000001: the photograph is all black"), "{:?}", data.warnings());
+    assert!(data.warnings()[1].contains("000004: the photograph is all over-exposed"), "{:?}", data.warnings());
+    views[1..].iter_mut().for_each(|view| view.0 = Image::filled(SIZE, [0; 3]));
+    let most = written(views, &dir.path().join("most"));
+    let error = RayDataset::open(&most, &options, &Silent).expect_err("one view").to_string();
+    assert!(error.contains("5 of 6 photographs are all black"), "{error}");
+}
+
+#[test]
+fn a_sequence_on_disk_becomes_a_mesh_and_pictures() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let sequence = written(photographs(9, ball(0.06)), &dir.path().join("ball"));
     let mut options = FieldOptions::preset("neus", "fast", 0).expect("a known method");
     options.method = Method::Neus(small_neus().with_iterations(60));
     options.data.max_side_px = 64;
