@@ -1,9 +1,9 @@
 //! Trains a method on a sequence and prints its curve: `cargo bench -p mb-neural --bench train -- SEQ METHOD STEPS
 //! MAX_SIDE_PX OUT [OPTIONS]`. Every twentieth of the run: wall and CPU seconds, PSNR of the training rays, PSNR of the
 //! held-out views on every 61st pixel (its time is not counted), and what a step took on average since the row before
-//! (`pytorch_methods.py` beside this file takes as many rays and samples; light reaches the lit ones). At the end the held-out views in full, each
-//! written to OUT beside its photograph. OPTIONS is JSON that replaces options of the preset, such as
-//! `{"samples_per_step": 32768}`; `"cameras"` and `"data"` in it replace those.
+//! (`pytorch_methods.py` beside this file takes as many rays and samples; light reaches the lit ones). At the end the
+//! held-out views in full, each written to OUT beside its photograph. OPTIONS is JSON that replaces options of the
+//! preset, such as `{"samples_per_step": 32768}`; `"cameras"` and `"data"` in it replace those.
 
 use std::time::Instant;
 

@@ -231,12 +231,13 @@ impl RayDataset {
             return Err(InputError::new(
                 sequence.root().join("image"),
                 format!(
-                    "{blank} of {} photographs are all black or over-exposed; {training} are left for training, at least \
-                     {MIN_TRAINING} are needed",
-                    frames.len()
+                    "{training} of {} photographs are left for training, at least {MIN_TRAINING} are needed: {blank} are all \
+                     black or over-exposed, {} are held out",
+                    frames.len(),
+                    views.len() - training
                 ),
             )
-            .help("Film the object again with the exposure set for it")
+            .help("Film the object again, with the exposure set for it; 40 or more photographs are usual")
             .into());
         }
         let named = match sequence.neus_cameras_path() {

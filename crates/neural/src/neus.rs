@@ -7,9 +7,9 @@
 //!
 //! `mean |C - C*| + eikonal * mean (|n| - 1)^2 + mask * BCE(1 - T, mask)`,
 //!
-//! the second over the samples and over random points of the ball. Levels of the hash grid join one by one (coarse to
-//! fine), so that the shape settles before its details. All derivatives are exact ([`crate::sdf_field`],
-//! [`crate::neus_alpha`], [`crate::composite`]).
+//! the second over the samples and over random points of the ball; its weight falls once the shape has settled. Levels
+//! of the hash grid join one by one (coarse to fine), so that the shape settles before its details. All derivatives are
+//! exact ([`crate::sdf_field`], [`crate::neus_alpha`], [`crate::composite`]).
 
 use mb_job::{Result, Rng, rng};
 use rand::RngExt;
