@@ -2,7 +2,7 @@
 //! `cargo bench -p mb-gpu --features wgpu --bench kernels -- [gpu|gpu:N] [SAMPLES]`. Sizes are those of `nerf`, `neus` and
 //! `dvgo` with `--preset fast`, but for the published trunk.
 //! Device: wall milliseconds, best of five, and CPU milliseconds of this process (which a software device spends, a GPU
-//! does not). Twin: CPU milliseconds. Share: of the arithmetic (GFLOP/s) or traffic (GB/s) that the kernel needs at least.
+//! does not, but for the handing over of work). Twin: CPU milliseconds. Share: of the arithmetic (GFLOP/s) or traffic (GB/s) that the kernel needs at least.
 
 use std::time::Instant;
 
@@ -33,16 +33,22 @@ struct Rows<'a> {
 }
 
 impl Rows<'_> {
-    fn row(&self, name: &str, giga: f64, unit: &str, record: impl Fn(&mut Work<'_>), twin: impl FnOnce()) {
-        self.row_after(|_| (), name, giga, unit, record, twin);
-    }
-
-    /// Runs what is recorded, and waits.
-    fn run(&self, record: impl Fn(&mut Work<'_>)) {
-        let mut work = self.context.work();
-        record(&mut work);
-        work.submit();
-        self.context.read::<u32>(self.probe, 1).expect("the device works");
+    /// Wall and CPU seconds of what is recorded, the best of five: recorded so often in one submission that the wait for it
+    /// counts little.
+    fn time(&self, record: impl Fn(&mut Work<'_>)) -> [f64; 2] {
+        let run = |times: usize| {
+            let (start, spent) = (Instant::now(), ProcessTime::now());
+            let mut work = self.context.work();
+            for _ in 0..times {
+                record(&mut work);
+            }
+            work.submit();
+            self.context.read::<u32>(self.probe, 1).expect("the device works");
+            [start.elapsed().as_secs_f64(), spent.elapsed().as_secs_f64()].map(|seconds| seconds / times as f64)
+        };
+        run(1);
+        let times = (0.02 / run(1)[0]).clamp(1.0, 64.0) as usize;
+        (0..5).map(|_| run(times)).fold([f64::INFINITY; 2], |best, found| [0, 1].map(|i| best[i].min(found[i])))
     }
 
     /// The same where something has to happen `before` each run, which is not measured.
@@ -55,14 +61,19 @@ impl Rows<'_> {
         record: impl Fn(&mut Work<'_>),
         twin: impl FnOnce(),
     ) {
-        let (mut wall, mut cpu) = (f64::INFINITY, f64::INFINITY);
-        for _ in 0..5 {
-            self.run(&before);
-            let (start, spent) = (Instant::now(), ProcessTime::now());
-            self.run(&record);
-            wall = wall.min(start.elapsed().as_secs_f64());
-            cpu = cpu.min(spent.elapsed().as_secs_f64());
-        }
+        let without = self.time(&before);
+        let with = self.time(|work| {
+            before(work);
+            record(work);
+        });
+        self.print(name, giga, unit, [0, 1].map(|i| with[i] - without[i]), twin);
+    }
+
+    fn row(&self, name: &str, giga: f64, unit: &str, record: impl Fn(&mut Work<'_>), twin: impl FnOnce()) {
+        self.print(name, giga, unit, self.time(record), twin);
+    }
+
+    fn print(&self, name: &str, giga: f64, unit: &str, [wall, cpu]: [f64; 2], twin: impl FnOnce()) {
         let spent = ProcessTime::now();
         twin();
         let twin = spent.elapsed().as_secs_f64();
@@ -95,6 +106,9 @@ fn main() {
     let mut rng = mb_job::rng(0, 0);
     let mut p = field.init(&mut rng);
     let (grid, density, color) = field.parts();
+    let filled = context.zeros(1 << 27);
+    rows.row("filling half a GiB", 0.5 * 1.0737, "GB", |work| work.clear(&filled), || ());
+    drop(filled);
     // Samples along rays, as marching gives them.
     let x: Vec<[f32; 3]> = (0..n.div_ceil(32))
         .flat_map(|_| {

@@ -1,6 +1,8 @@
 //! One device of wgpu: its buffers, kernels and transfers.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bytemuck::Pod;
 use mb_job::{Error, Result};
@@ -13,24 +15,65 @@ pub struct Context {
     pub name: String,
     /// What the device complained of first.
     complaint: Arc<Mutex<Option<String>>>,
+    /// Numbers kernels and buffers.
+    next: AtomicU64,
+    bindings: Mutex<Bindings>,
+    profile: Option<Profile>,
 }
 
 /// A compiled entry point.
-pub struct Kernel(wgpu::ComputePipeline);
+pub struct Kernel {
+    pipeline: wgpu::ComputePipeline,
+    layout: wgpu::BindGroupLayout,
+    name: String,
+    number: u64,
+}
 
 /// Storage on the device, which grows.
-pub struct Buffer(wgpu::Buffer);
+pub struct Buffer {
+    buffer: wgpu::Buffer,
+    number: u64,
+}
+
+/// Which buffers a kernel is bound to: what a step binds, the next one binds again.
+#[derive(Default)]
+struct Bindings {
+    /// By the kernel, the bindings and the buffers; with the submission that used it last.
+    groups: BTreeMap<(u64, Vec<(u32, u64)>), (wgpu::BindGroup, u64)>,
+    submissions: u64,
+}
+
+/// Submissions after which buffers that nobody binds any more are let go.
+const FORGET: u64 = 64;
+
+/// How long each kernel ran.
+struct Profile {
+    stamps: wgpu::QuerySet,
+    /// Where a submission's stamps go.
+    resolved: wgpu::Buffer,
+    /// Seconds and runs, by the kernel's name.
+    spent: Mutex<BTreeMap<String, (f64, u64)>>,
+}
+
+/// Stamps of one submission, at most.
+const STAMPS: u32 = 4096;
 
 /// Commands that are recorded, to be sent at once.
 pub struct Work<'a> {
     context: &'a Context,
+    // The pass ends before what it is recorded into.
+    pass: Option<wgpu::ComputePass<'static>>,
     encoder: wgpu::CommandEncoder,
+    /// The kernels that were stamped.
+    stamped: Vec<String>,
 }
 
 /// Threads of a workgroup in every kernel.
 pub const WORKGROUP: usize = 64;
 /// Storage buffers of the kernel that has most.
 const STORAGE_BUFFERS: u32 = 15;
+/// Bytes of a kernel's sizes, at most.
+const SIZES: u32 = 64;
 /// Workgroups in a row; a device allows 65535.
 const ROW: usize = 32_768;
 
@@ -54,7 +97,7 @@ impl Context {
     /// The first device that is no software, where there is one.
     pub fn first_hardware() -> Option<Self> {
         let (adapter, _) = adapters().into_iter().find(|(_, software)| !software)?;
-        Self::open(&adapter).ok()
+        Self::open(&adapter, false).ok()
     }
 
     /// The `number`-th device, or the first one, hardware before software.
@@ -62,6 +105,18 @@ impl Context {
     /// # Errors
     /// There is no such device, or it cannot be opened: the devices that there are.
     pub fn numbered(number: Option<usize>) -> Result<Self> {
+        Self::choose(number, false)
+    }
+
+    /// The same device, which waits for whatever is sent and keeps the time of each kernel: see [`Self::spent`].
+    ///
+    /// # Errors
+    /// As [`Self::numbered`]; the device has no clock.
+    pub fn profiled(number: Option<usize>) -> Result<Self> {
+        Self::choose(number, true)
+    }
+
+    fn choose(number: Option<usize>, profiled: bool) -> Result<Self> {
         let adapters = adapters();
         let hardware = adapters.iter().position(|(_, software)| !software).unwrap_or(0);
         let Some((adapter, _)) = adapters.get(number.unwrap_or(hardware)) else {
@@ -72,10 +127,10 @@ impl Context {
                 "no such GPU: {found}. Install the GPU's Vulkan driver, or use --device cpu"
             )));
         };
-        Self::open(adapter)
+        Self::open(adapter, profiled)
     }
 
-    fn open(adapter: &wgpu::Adapter) -> Result<Self> {
+    fn open(adapter: &wgpu::Adapter, profiled: bool) -> Result<Self> {
         let name = adapter.get_info().name;
         let buffers = adapter.limits().max_storage_buffers_per_shader_stage;
         if buffers < STORAGE_BUFFERS {
@@ -83,21 +138,60 @@ impl Context {
                 "{name} is too small: its kernels can have {buffers} buffers, and {STORAGE_BUFFERS} are needed. Use --device cpu"
             )));
         }
-        let (device, queue) = pollster::block_on(
-            adapter.request_device(&wgpu::DeviceDescriptor { required_limits: adapter.limits(), ..Default::default() }),
-        )
+        let bytes = adapter.limits().max_immediate_size;
+        if bytes < SIZES || !adapter.features().contains(wgpu::Features::IMMEDIATES) {
+            return Err(Error::Failed(format!(
+                "{name} is too small: its kernels can be given {bytes} bytes, and {SIZES} are needed. Use --device cpu"
+            )));
+        }
+        let mut features = wgpu::Features::IMMEDIATES;
+        if profiled {
+            features |= wgpu::Features::TIMESTAMP_QUERY;
+        }
+        let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+            required_features: features,
+            required_limits: adapter.limits(),
+            ..Default::default()
+        }))
         .map_err(|e| Error::Failed(format!("{name} cannot be opened: {e}. Use --device cpu")))?;
         let complaint = Arc::new(Mutex::new(None));
         let first = Arc::clone(&complaint);
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
-            first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert_with(|| e.to_string());
+            lock(&first).get_or_insert_with(|| e.to_string());
         }));
         let first = Arc::clone(&complaint);
         device.set_device_lost_callback(move |_, why| {
             // What it complains of afterwards is only a consequence.
-            *first.lock().unwrap_or_else(PoisonError::into_inner) = Some(format!("it was lost ({why})"));
+            *lock(&first) = Some(format!("it was lost ({why})"));
         });
-        Ok(Self { device, queue, name, complaint })
+        let profile = profiled.then(|| Profile {
+            stamps: device.create_query_set(&wgpu::QuerySetDescriptor {
+                label: None,
+                ty: wgpu::QueryType::Timestamp,
+                count: STAMPS,
+            }),
+            resolved: device.create_buffer(&wgpu::BufferDescriptor {
+                label: None,
+                size: 8 * u64::from(STAMPS),
+                usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
+                mapped_at_creation: false,
+            }),
+            spent: Mutex::default(),
+        });
+        Ok(Self { device, queue, name, complaint, next: AtomicU64::new(0), bindings: Mutex::default(), profile })
+    }
+
+    /// Seconds and runs of each kernel, the longest first; nothing where the context is not profiled.
+    pub fn spent(&self) -> Vec<(String, f64, u64)> {
+        let Some(profile) = &self.profile else { return Vec::new() };
+        let spent = lock(&profile.spent);
+        let mut spent: Vec<_> = spent.iter().map(|(name, (seconds, runs))| (name.clone(), *seconds, *runs)).collect();
+        spent.sort_by(|a, b| b.1.total_cmp(&a.1));
+        spent
+    }
+
+    fn number(&self) -> u64 {
+        self.next.fetch_add(1, Ordering::Relaxed)
     }
 
     /// Loses the device, for tests.
@@ -108,49 +202,56 @@ impl Context {
 
     /// Compiles an entry point of a WGSL source, with its `override` constants.
     pub fn kernel(&self, source: &str, entry: &str, constants: &[(&str, f64)]) -> Kernel {
-        let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: Some(entry),
-            source: wgpu::ShaderSource::Wgsl(source.into()),
-        });
+        let descriptor =
+            wgpu::ShaderModuleDescriptor { label: Some(entry), source: wgpu::ShaderSource::Wgsl(source.into()) };
+        // A counter in every loop would keep the driver from unrolling it.
+        let checks = wgpu::ShaderRuntimeChecks { force_loop_bounding: false, ..wgpu::ShaderRuntimeChecks::checked() };
+        // SAFETY: accesses stay checked. The sources are this crate's own, and each of their loops counts towards an end that
+        // it does not move; that of march.wgsl walks at least one step of a positive length.
+        let module = unsafe { self.device.create_shader_module_trusted(descriptor, checks) };
         // Tiles are written before they are read.
         let options = wgpu::PipelineCompilationOptions { constants, zero_initialize_workgroup_memory: false };
-        Kernel(self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        let pipeline = self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(entry),
             layout: None,
             module: &module,
             entry_point: Some(entry),
             compilation_options: options,
             cache: None,
-        }))
+        });
+        let layout = pipeline.get_bind_group_layout(0);
+        let constants: String = constants.iter().map(|(name, value)| format!(" {name}={value}")).collect();
+        Kernel { pipeline, layout, name: format!("{entry}{constants}"), number: self.number() }
     }
 
     /// Zeros: `len` numbers of four bytes.
     pub fn zeros(&self, len: usize) -> Buffer {
-        Buffer(self.device.create_buffer(&wgpu::BufferDescriptor {
+        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
             label: None,
             // An empty buffer cannot be bound.
             size: 4 * len.max(4) as u64,
             usage: USAGE,
             mapped_at_creation: false,
-        }))
+        });
+        Buffer { buffer, number: self.number() }
     }
 
     /// A buffer with this content.
     pub fn upload<T: Pod>(&self, content: &[T]) -> Buffer {
         let buffer = self.zeros(size_of_val(content).div_ceil(4));
         // A lost device refuses this without a panic, unlike a buffer that is mapped when it is made.
-        self.queue.write_buffer(&buffer.0, 0, bytemuck::cast_slice(content));
+        self.queue.write_buffer(&buffer.buffer, 0, bytemuck::cast_slice(content));
         buffer
     }
 
     /// Replaces numbers of a buffer from number `first` on, before whatever is sent next.
     pub fn write(&self, buffer: &Buffer, first: usize, content: &[f32]) {
-        self.queue.write_buffer(&buffer.0, 4 * first as u64, bytemuck::cast_slice(content));
+        self.queue.write_buffer(&buffer.buffer, 4 * first as u64, bytemuck::cast_slice(content));
     }
 
     /// Makes room for `len` numbers of four bytes; the content is lost where the buffer has to grow.
     pub fn reserve(&self, buffer: &mut Buffer, len: usize) {
-        if buffer.0.size() < 4 * len as u64 {
+        if buffer.buffer.size() < 4 * len as u64 {
             *buffer = self.zeros(len + len / 4);
         }
     }
@@ -160,6 +261,10 @@ impl Context {
     /// # Errors
     /// The device was lost, ran out of memory or refused something since the last call.
     pub fn read<T: Pod>(&self, buffer: &Buffer, len: usize) -> Result<Vec<T>> {
+        self.copy_back(&buffer.buffer, len)
+    }
+
+    fn copy_back<T: Pod>(&self, buffer: &wgpu::Buffer, len: usize) -> Result<Vec<T>> {
         let size = (len * size_of::<T>()) as u64;
         if size == 0 {
             return Ok(Vec::new());
@@ -171,12 +276,12 @@ impl Context {
             mapped_at_creation: false,
         });
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-        encoder.copy_buffer_to_buffer(&buffer.0, 0, &staging, 0, size);
+        encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, size);
         self.queue.submit([encoder.finish()]);
         // A failure shows when the range is asked for.
         staging.map_async(wgpu::MapMode::Read, .., |_| ());
         let waited = self.device.poll(wgpu::PollType::wait_indefinitely()).map_err(|e| e.to_string());
-        let complaint = self.complaint.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let complaint = lock(&self.complaint).take();
         let content = match complaint {
             Some(complaint) => Err(complaint),
             None => waited.and_then(|_| {
@@ -190,51 +295,99 @@ impl Context {
     /// Begins to record.
     pub fn work(&self) -> Work<'_> {
         let encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-        Work { context: self, encoder }
+        Work { context: self, pass: None, encoder, stamped: Vec::new() }
+    }
+
+    /// Binds a kernel to buffers.
+    fn bind(&self, kernel: &Kernel, buffers: &[(u32, &Buffer)]) -> wgpu::BindGroup {
+        let mut bindings = lock(&self.bindings);
+        let now = bindings.submissions;
+        let key = (kernel.number, buffers.iter().map(|(binding, buffer)| (*binding, buffer.number)).collect());
+        let (group, used) = bindings.groups.entry(key).or_insert_with(|| {
+            let entries = buffers.iter().map(|(binding, buffer)| wgpu::BindGroupEntry {
+                binding: *binding,
+                resource: buffer.buffer.as_entire_binding(),
+            });
+            let group = self.device.create_bind_group(&wgpu::BindGroupDescriptor {
+                label: None,
+                layout: &kernel.layout,
+                entries: &entries.collect::<Vec<_>>(),
+            });
+            (group, now)
+        });
+        *used = now;
+        group.clone()
     }
 }
 
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 impl Work<'_> {
-    /// Runs at least so many threads. `sizes` are the words of the uniform at binding 0; each buffer has the number of its
+    /// Runs at least so many threads. `sizes` are the words that the kernel calls so; each buffer has the number of its
     /// binding.
     pub fn run(&mut self, kernel: &Kernel, sizes: &[u32], buffers: &[(u32, &Buffer)], threads: usize) {
         if threads == 0 {
             return;
         }
-        let device = &self.context.device;
-        let mut words = sizes.to_vec();
-        words.resize(sizes.len().next_multiple_of(4), 0);
-        let uniform = device.create_buffer(&wgpu::BufferDescriptor {
-            label: None,
-            size: 4 * words.len() as u64,
-            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
-        self.context.queue.write_buffer(&uniform, 0, bytemuck::cast_slice(&words));
-        let mut entries = vec![wgpu::BindGroupEntry { binding: 0, resource: uniform.as_entire_binding() }];
-        entries.extend(buffers.iter().map(|(binding, buffer)| wgpu::BindGroupEntry {
-            binding: *binding,
-            resource: buffer.0.as_entire_binding(),
-        }));
-        let group = device.create_bind_group(&wgpu::BindGroupDescriptor {
-            label: None,
-            layout: &kernel.0.get_bind_group_layout(0),
-            entries: &entries,
-        });
+        let group = self.context.bind(kernel, buffers);
         let groups = threads.div_ceil(WORKGROUP);
-        let mut pass = self.encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-        pass.set_pipeline(&kernel.0);
+        if let Some(profile) = &self.context.profile {
+            let first = 2 * self.stamped.len() as u32;
+            let timestamp_writes = (first < STAMPS).then(|| {
+                self.stamped.push(kernel.name.clone());
+                wgpu::ComputePassTimestampWrites {
+                    query_set: &profile.stamps,
+                    beginning_of_pass_write_index: Some(first),
+                    end_of_pass_write_index: Some(first + 1),
+                }
+            });
+            // A pass of its own, since stamps are those of passes.
+            self.pass = None;
+            let descriptor = wgpu::ComputePassDescriptor { label: None, timestamp_writes };
+            self.pass = Some(self.encoder.begin_compute_pass(&descriptor).forget_lifetime());
+        }
+        let encoder = &mut self.encoder;
+        let pass = self.pass.get_or_insert_with(|| {
+            encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default()).forget_lifetime()
+        });
+        pass.set_pipeline(&kernel.pipeline);
         pass.set_bind_group(0, &group, &[]);
+        pass.set_immediates(0, bytemuck::cast_slice(sizes));
         pass.dispatch_workgroups(groups.min(ROW) as u32, groups.div_ceil(ROW) as u32, 1);
     }
 
     /// Fills a buffer with zeros.
     pub fn clear(&mut self, buffer: &Buffer) {
-        self.encoder.clear_buffer(&buffer.0, 0, None);
+        self.pass = None;
+        self.encoder.clear_buffer(&buffer.buffer, 0, None);
     }
 
     /// Sends what was recorded.
-    pub fn submit(self) {
-        self.context.queue.submit([self.encoder.finish()]);
+    pub fn submit(mut self) {
+        self.pass = None;
+        let context = self.context;
+        {
+            let mut bindings = lock(&context.bindings);
+            bindings.submissions += 1;
+            let oldest = bindings.submissions.saturating_sub(FORGET);
+            bindings.groups.retain(|_, (_, used)| *used >= oldest);
+        }
+        let Some(profile) = &context.profile else {
+            context.queue.submit([self.encoder.finish()]);
+            return;
+        };
+        let stamps = 2 * self.stamped.len() as u32;
+        self.encoder.resolve_query_set(&profile.stamps, 0..stamps, &profile.resolved, 0);
+        context.queue.submit([self.encoder.finish()]);
+        let Ok(stamps) = context.copy_back::<[u64; 2]>(&profile.resolved, self.stamped.len()) else { return };
+        let tick = 1e-9 * f64::from(context.queue.get_timestamp_period());
+        let mut spent = lock(&profile.spent);
+        for (name, [begin, end]) in self.stamped.into_iter().zip(stamps) {
+            let (seconds, runs) = spent.entry(name).or_default();
+            *seconds += tick * end.saturating_sub(begin) as f64;
+            *runs += 1;
+        }
     }
 }

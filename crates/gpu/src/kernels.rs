@@ -28,8 +28,9 @@ pub struct Kernels {
     pub adam_scaled: Kernel,
     pub adam_network: Kernel,
     pub losses: Kernel,
-    pub layer: Kernel,
-    pub input_gradient: Kernel,
+    /// In wide tiles, and in narrow ones.
+    pub layer: [Kernel; 2],
+    pub input_gradient: [Kernel; 2],
     pub weight_gradient: Kernel,
     pub encode: Kernel,
     pub normals: Kernel,
@@ -100,7 +101,8 @@ impl Kernels {
             voxels,
         ] = SOURCES.map(|(_, source)| source);
         let kernel = |source, entry| context.kernel(source, entry, &[]);
-        let product = |number| context.kernel(dense, "multiply", &[("product", number)]);
+        let product =
+            |number, narrow| context.kernel(dense, "multiply", &[("product", number), ("narrow", narrow)]);
         let walk = |inside, voxels| {
             ["count", "place"].map(|entry| context.kernel(march, entry, &[("inside_ball", inside), ("voxels", voxels)]))
         };
@@ -109,9 +111,9 @@ impl Kernels {
             adam_scaled: kernel(adam, "scaled"),
             adam_network: kernel(adam, "network"),
             losses: kernel(composite, "losses_of_rays"),
-            layer: product(0.0),
-            input_gradient: product(1.0),
-            weight_gradient: product(2.0),
+            layer: [product(0.0, 0.0), product(0.0, 1.0)],
+            input_gradient: [product(1.0, 0.0), product(1.0, 1.0)],
+            weight_gradient: product(2.0, 0.0),
             encode: kernel(encode, "forward"),
             normals: kernel(encode, "normals_of"),
             encode_tangent: kernel(encode, "tangent"),

@@ -58,18 +58,21 @@ pub struct Network {
     pub gradient: Buffer,
 }
 
-/// Partial sums of the weights' gradient, at most, and their rows, at least.
-const PIECES: usize = 128;
+/// Partial sums of the weights' gradient, at most, and numbers in all of them together; their rows, at least.
+const PIECES: usize = 1024;
+const PARTIAL_SUMS: usize = 1 << 25;
 const PIECE: usize = 256;
 
-/// Rows of one partial sum.
-fn piece_of(rows: usize) -> usize {
-    rows.div_ceil(PIECES).max(PIECE)
+/// Threads for a product of this size: a workgroup for each tile of 64 x 64, or of 256 x 16.
+fn threads_of(height: usize, width: usize, narrow: bool) -> usize {
+    let [tall, wide] = if narrow { [256, 16] } else { [64, 64] };
+    height.div_ceil(tall) * width.div_ceil(wide) * WORKGROUP
 }
 
-/// Threads for a product of this size: a workgroup for each tile of 32 x 32.
-fn threads_of(height: usize, width: usize) -> usize {
-    height.div_ceil(32) * width.div_ceil(32) * WORKGROUP
+/// The kernel for a product with this many columns: tall tiles where few would be used of wide ones.
+fn product_of(kernels: &[Kernel; 2], width: usize) -> (&Kernel, bool) {
+    let narrow = width <= 16;
+    (&kernels[usize::from(narrow)], narrow)
 }
 
 /// One product of a layer: see `dense.wgsl`.
@@ -173,7 +176,7 @@ impl Network {
         if second_order {
             context.reserve(&mut self.gradient, samples * self.layers[0].in_stride);
         }
-        self.pieces = samples.div_ceil(piece_of(samples));
+        self.pieces = samples.div_ceil(self.piece_of(samples));
         context.reserve(&mut self.partial_sums, self.pieces * self.parameters.len);
     }
 
@@ -195,6 +198,12 @@ impl Network {
     /// The weights in use.
     fn weights(&self) -> &Buffer {
         self.gains.as_ref().map_or(&self.parameters.values, |gains| &gains.weights)
+    }
+
+    /// Rows of one partial sum.
+    fn piece_of(&self, rows: usize) -> usize {
+        let pieces = (PARTIAL_SUMS / self.parameters.len.max(1)).clamp(1, PIECES);
+        rows.div_ceil(pieces).max(PIECE)
     }
 
     fn beta(&self) -> f32 {
@@ -219,7 +228,7 @@ impl Network {
             layer.weights as u32,
             activation,
             self.parameters.len as u32,
-            piece_of(rows) as u32,
+            self.piece_of(rows) as u32,
             self.beta().to_bits(),
             u32::from(p.tangent),
             u32::from(p.unit),
@@ -235,8 +244,9 @@ impl Network {
     /// `x W` of a layer, with bias and activation, or, of tangents, without.
     fn layer(&self, work: &mut Work<'_>, k: &Kernels, i: usize, [x, z]: [&Buffer; 2], rows: usize, tangent: bool) {
         let layer = &self.layers[i];
+        let (kernel, narrow) = product_of(&k.layer, layer.weight_stride);
         let p = Product {
-            kernel: &k.layer,
+            kernel,
             x,
             z,
             dx: &layer.d_input,
@@ -244,7 +254,7 @@ impl Network {
             tangent,
             unit: false,
             out_scale: self.layers.get(i + 1).map_or(1.0, |next| next.scale),
-            threads: threads_of(rows, layer.weight_stride),
+            threads: threads_of(rows, layer.weight_stride, narrow),
         };
         self.product(work, layer, rows, &p);
     }
@@ -252,9 +262,10 @@ impl Network {
     /// `dz W^T` of a layer, times the slope of what came in.
     fn input_gradient(&self, work: &mut Work<'_>, k: &Kernels, i: usize, [x, z, dx]: [&Buffer; 3], rows: usize) {
         let layer = &self.layers[i];
-        let threads = threads_of(rows, layer.inputs);
+        let (kernel, narrow) = product_of(&k.input_gradient, layer.inputs);
+        let threads = threads_of(rows, layer.inputs, narrow);
         let p = Product {
-            kernel: &k.input_gradient,
+            kernel,
             x,
             z,
             dx,
@@ -278,7 +289,6 @@ impl Network {
         tangent: bool,
     ) {
         let layer = &self.layers[i];
-        let height = layer.inputs + usize::from(!tangent);
         let p = Product {
             kernel: &k.weight_gradient,
             x,
@@ -288,7 +298,7 @@ impl Network {
             tangent,
             unit: tangent && i + 1 == self.layers.len(),
             out_scale: 1.0,
-            threads: rows.div_ceil(piece_of(rows)) * threads_of(height, layer.weight_stride),
+            threads: rows.div_ceil(self.piece_of(rows)) * threads_of(layer.inputs, layer.weight_stride, false),
         };
         self.product(work, layer, rows, &p);
     }

@@ -12,7 +12,7 @@ fn every_shader_is_valid_and_every_entry_point_has_the_same_workgroup() {
         let shown = path.display();
         let module = naga::front::wgsl::parse_str(&source)
             .unwrap_or_else(|e| panic!("{shown}: {}", e.emit_to_string_with_path(&source, &shown.to_string())));
-        Validator::new(ValidationFlags::all(), Capabilities::empty())
+        Validator::new(ValidationFlags::all(), Capabilities::IMMEDIATES)
             .validate(&module)
             .unwrap_or_else(|e| panic!("{shown}: {}", e.emit_to_string_with_path(&source, &shown.to_string())));
         // `Context` asks a device for so many.

@@ -17,7 +17,7 @@ struct Sizes {
     width: u32,
 }
 
-@group(0) @binding(0) var<uniform> sizes: Sizes;
+var<immediate> sizes: Sizes;
 @group(0) @binding(1) var<storage, read_write> values: array<f32>;
 @group(0) @binding(2) var<storage, read_write> m: array<f32>;
 @group(0) @binding(3) var<storage, read_write> v: array<f32>;
@@ -46,43 +46,50 @@ fn real(sum: vec2<u32>) -> f32 {
     return -(f32(high) * 4294967296.0 + f32(low));
 }
 
-fn is_touched(first: u32, last: u32) -> bool {
-    var bits = 0u;
-    for (var i = first; i < last; i += 1u) {
-        bits |= sums[i].x | sums[i].y;
+// Of each run of sixteen parameters of a workgroup's: whether a sample touched it.
+var<workgroup> touched: array<atomic<u32>, 4>;
+
+// Takes a parameter's derivative, which is cleared, to a step with this rate, where its run was touched: the others keep their
+// values and moments.
+fn update_of_run(i: u32, thread: u32, rate: f32) {
+    if thread < 4u {
+        atomicStore(&touched[thread], 0u);
     }
-    return bits != 0u;
+    workgroupBarrier();
+    var sum = vec2(0u);
+    if i < sizes.parameters {
+        sum = sums[i];
+    }
+    let found = any(sum != vec2(0u));
+    if found {
+        atomicStore(&touched[thread / 16u], 1u);
+        sums[i] = vec2(0u);
+    }
+    workgroupBarrier();
+    if i < sizes.parameters && atomicLoad(&touched[thread / 16u]) == 1u {
+        update(i, real(sum) * sizes.unit, rate);
+    }
 }
 
-// A parameter's derivative, which is cleared.
-fn take(i: u32) -> f32 {
-    let g = real(sums[i]) * sizes.unit;
-    sums[i] = vec2(0u);
-    return g;
-}
-
-// One thread for a run of sixteen parameters: runs that no sample touched keep their values and moments.
+// One thread for each parameter.
 @compute @workgroup_size(64)
-fn table(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let first = (id.y * groups.x * 64u + id.x) * 16u;
-    let last = min(first + 16u, sizes.parameters);
-    if is_touched(first, last) {
-        for (var i = first; i < last; i += 1u) {
-            update(i, take(i), sizes.rate);
-        }
-    }
+fn table(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    update_of_run((group.y * groups.x + group.x) * 64u + thread, thread, sizes.rate);
 }
 
 // The same where each entry has a factor.
 @compute @workgroup_size(64)
-fn scaled(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let first = (id.y * groups.x * 64u + id.x) * 16u;
-    let last = min(first + 16u, sizes.parameters);
-    if is_touched(first, last) {
-        for (var i = first; i < last; i += 1u) {
-            update(i, take(i), sizes.rate * scales[i / sizes.width]);
-        }
-    }
+fn scaled(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let i = (group.y * groups.x + group.x) * 64u + thread;
+    update_of_run(i, thread, sizes.rate * scales[min(i, sizes.parameters - 1u) / sizes.width]);
 }
 
 // One thread for each parameter.

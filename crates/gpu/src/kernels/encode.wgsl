@@ -28,7 +28,7 @@ struct Level {
     entries: u32,
 }
 
-@group(0) @binding(0) var<uniform> sizes: Sizes;
+var<immediate> sizes: Sizes;
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
 // [samples, 3]: position in the unit cube.
 @group(0) @binding(2) var<storage, read> positions: array<f32>;

@@ -19,7 +19,7 @@ struct Sizes {
     activation: u32,
 }
 
-@group(0) @binding(0) var<uniform> sizes: Sizes;
+var<immediate> sizes: Sizes;
 // [rays, 20], see march.wgsl.
 @group(0) @binding(1) var<storage, read> rays: array<f32>;
 @group(0) @binding(2) var<storage, read> ray_of: array<u32>;

@@ -8,7 +8,7 @@ struct Sizes {
     pieces: u32,
 }
 
-@group(0) @binding(0) var<uniform> sizes: Sizes;
+var<immediate> sizes: Sizes;
 // [columns]: where the column begins, row length, rows; the bias is the row behind them.
 @group(0) @binding(1) var<storage, read> columns: array<vec4<u32>>;
 // v, and g.

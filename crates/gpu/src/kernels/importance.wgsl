@@ -10,7 +10,7 @@ struct Sizes {
     inside_ball: u32,
 }
 
-@group(0) @binding(0) var<uniform> sizes: Sizes;
+var<immediate> sizes: Sizes;
 // [rays, 20], see march.wgsl; the ball ends where the last sample does.
 @group(0) @binding(1) var<storage, read> rays: array<f32>;
 // `place`: [rays, coarse], ascending distances. `draw`: [rays, fine], random numbers in 0..1.

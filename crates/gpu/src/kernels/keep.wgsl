@@ -10,7 +10,7 @@ struct Sizes {
     stride: u32,
 }
 
-@group(0) @binding(0) var<uniform> sizes: Sizes;
+var<immediate> sizes: Sizes;
 // [rays + 1]: where each ray's samples begin.
 @group(0) @binding(1) var<storage, read> starts: array<u32>;
 // [samples, stride]: the distance comes first.

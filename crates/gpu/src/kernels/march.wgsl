@@ -23,7 +23,7 @@ struct Sizes {
     high_z: f32,
 }
 
-@group(0) @binding(0) var<uniform> sizes: Sizes;
+var<immediate> sizes: Sizes;
 // [rays, 20]: origin, direction, jitter, wanted colour, background, where contracted space begins, where the ball begins and
 // ends, the mask (negative: none), the colour that was photographed.
 @group(0) @binding(1) var<storage, read> rays: array<f32>;

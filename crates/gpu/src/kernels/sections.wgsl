@@ -18,7 +18,7 @@ struct Sizes {
     relaxed: f32,
 }
 
-@group(0) @binding(0) var<uniform> sizes: Sizes;
+var<immediate> sizes: Sizes;
 // [rays, 20], see march.wgsl.
 @group(0) @binding(1) var<storage, read> rays: array<f32>;
 // [rays, starts]: distance along the ray; distance from the surface.

@@ -11,7 +11,7 @@ struct Sizes {
     scale: f32,
 }
 
-@group(0) @binding(0) var<uniform> sizes: Sizes;
+var<immediate> sizes: Sizes;
 // [rows, in_stride]: the input; `add` adds to its derivative.
 @group(0) @binding(1) var<storage, read_write> input: array<f32>;
 // [rows, stride]: what the layer sees, or its derivative, which has its scale already.

@@ -14,7 +14,7 @@ struct Sizes {
     scale: f32,
 }
 
-@group(0) @binding(0) var<uniform> sizes: Sizes;
+var<immediate> sizes: Sizes;
 @group(0) @binding(1) var<storage, read> parameters: array<f32>;
 // [rows, width], all.
 @group(0) @binding(2) var<storage, read> h: array<f32>;
