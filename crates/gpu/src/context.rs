@@ -18,6 +18,8 @@ pub struct Context {
     /// Numbers kernels and buffers.
     next: AtomicU64,
     bindings: Mutex<Bindings>,
+    /// Where what is read lands, for the next time.
+    staging: Mutex<Option<wgpu::Buffer>>,
     profile: Option<Profile>,
 }
 
@@ -61,7 +63,7 @@ const STAMPS: u32 = 4096;
 /// Commands that are recorded, to be sent at once.
 pub struct Work<'a> {
     context: &'a Context,
-    // The pass ends before what it is recorded into.
+    /// Ends before what it is recorded into does.
     pass: Option<wgpu::ComputePass<'static>>,
     encoder: wgpu::CommandEncoder,
     /// The kernels that were stamped.
@@ -178,7 +180,8 @@ impl Context {
             }),
             spent: Mutex::default(),
         });
-        Ok(Self { device, queue, name, complaint, next: AtomicU64::new(0), bindings: Mutex::default(), profile })
+        let (next, bindings, staging) = (AtomicU64::new(0), Mutex::default(), Mutex::default());
+        Ok(Self { device, queue, name, complaint, next, bindings, staging, profile })
     }
 
     /// Seconds and runs of each kernel, the longest first; nothing where the context is not profiled.
@@ -245,8 +248,14 @@ impl Context {
     }
 
     /// Replaces numbers of a buffer from number `first` on, before whatever is sent next.
-    pub fn write(&self, buffer: &Buffer, first: usize, content: &[f32]) {
+    pub fn write<T: Pod>(&self, buffer: &Buffer, first: usize, content: &[T]) {
         self.queue.write_buffer(&buffer.buffer, 4 * first as u64, bytemuck::cast_slice(content));
+    }
+
+    /// Replaces the content of a buffer, which grows where it has to.
+    pub fn replace<T: Pod>(&self, buffer: &mut Buffer, content: &[T]) {
+        self.reserve(buffer, size_of_val(content).div_ceil(4));
+        self.write(buffer, 0, content);
     }
 
     /// Makes room for `len` numbers of four bytes; the content is lost where the buffer has to grow.
@@ -261,35 +270,68 @@ impl Context {
     /// # Errors
     /// The device was lost, ran out of memory or refused something since the last call.
     pub fn read<T: Pod>(&self, buffer: &Buffer, len: usize) -> Result<Vec<T>> {
-        self.copy_back(&buffer.buffer, len)
+        self.read_with(buffer, len, |found: &[T]| found.to_vec())
     }
 
-    fn copy_back<T: Pod>(&self, buffer: &wgpu::Buffer, len: usize) -> Result<Vec<T>> {
-        let size = (len * size_of::<T>()) as u64;
+    /// The same, for one look.
+    ///
+    /// # Errors
+    /// As [`Self::read`].
+    pub fn read_with<T: Pod, R>(&self, buffer: &Buffer, len: usize, look: impl FnOnce(&[T]) -> R) -> Result<R> {
+        self.bring(&[(&buffer.buffer, len * size_of::<T>())], |bytes| look(bytemuck::cast_slice(bytes)))
+    }
+
+    /// The first words of several buffers, in one wait.
+    ///
+    /// # Errors
+    /// As [`Self::read`].
+    pub fn read_all(&self, buffers: &[(&Buffer, usize)]) -> Result<Vec<Vec<u32>>> {
+        let parts: Vec<_> = buffers.iter().map(|(buffer, len)| (&buffer.buffer, 4 * len)).collect();
+        self.bring(&parts, |bytes| {
+            let mut words: &[u32] = bytemuck::cast_slice(bytes);
+            buffers.iter().map(|(_, len)| words.split_off(..*len).unwrap_or_default().to_vec()).collect()
+        })
+    }
+
+    /// Copies the first bytes of buffers, one behind the other, to where the processor may `look`.
+    fn bring<R>(&self, parts: &[(&wgpu::Buffer, usize)], look: impl FnOnce(&[u8]) -> R) -> Result<R> {
+        let size = parts.iter().map(|(_, bytes)| *bytes as u64).sum::<u64>();
         if size == 0 {
-            return Ok(Vec::new());
+            // An empty slice of bytes need not lie where wider numbers may.
+            return Ok(look(bytemuck::cast_slice::<u64, u8>(&[])));
         }
-        let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
-            label: None,
-            size,
-            usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
+        let mut kept = lock(&self.staging);
+        let staging = kept.take().filter(|staging| staging.size() >= size).unwrap_or_else(|| {
+            self.device.create_buffer(&wgpu::BufferDescriptor {
+                label: None,
+                size: size.next_power_of_two(),
+                usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
+                mapped_at_creation: false,
+            })
         });
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-        encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, size);
+        let mut to = 0;
+        for (buffer, bytes) in parts.iter().filter(|(_, bytes)| *bytes > 0) {
+            encoder.copy_buffer_to_buffer(buffer, 0, &staging, to, *bytes as u64);
+            to += *bytes as u64;
+        }
         self.queue.submit([encoder.finish()]);
         // A failure shows when the range is asked for.
-        staging.map_async(wgpu::MapMode::Read, .., |_| ());
+        staging.map_async(wgpu::MapMode::Read, 0..size, |_| ());
         let waited = self.device.poll(wgpu::PollType::wait_indefinitely()).map_err(|e| e.to_string());
         let complaint = lock(&self.complaint).take();
-        let content = match complaint {
+        let found = match complaint {
             Some(complaint) => Err(complaint),
             None => waited.and_then(|_| {
-                let range = staging.get_mapped_range(..).map_err(|e| e.to_string())?;
-                Ok(bytemuck::pod_collect_to_vec(&range))
+                let range = staging.get_mapped_range(0..size).map_err(|e| e.to_string())?;
+                Ok(look(&range))
             }),
         };
-        content.map_err(|e| Error::Failed(format!("{} failed: {e}. Use --device cpu", self.name)))
+        if found.is_ok() {
+            staging.unmap();
+            *kept = Some(staging);
+        }
+        found.map_err(|e| Error::Failed(format!("{} failed: {e}. Use --device cpu", self.name)))
     }
 
     /// Begins to record.
@@ -381,7 +423,9 @@ impl Work<'_> {
         let stamps = 2 * self.stamped.len() as u32;
         self.encoder.resolve_query_set(&profile.stamps, 0..stamps, &profile.resolved, 0);
         context.queue.submit([self.encoder.finish()]);
-        let Ok(stamps) = context.copy_back::<[u64; 2]>(&profile.resolved, self.stamped.len()) else { return };
+        let bytes = 8 * stamps as usize;
+        let found = context.bring(&[(&profile.resolved, bytes)], bytemuck::pod_collect_to_vec::<u8, [u64; 2]>);
+        let Ok(stamps) = found else { return };
         let tick = 1e-9 * f64::from(context.queue.get_timestamp_period());
         let mut spent = lock(&profile.spent);
         for (name, [begin, end]) in self.stamped.into_iter().zip(stamps) {

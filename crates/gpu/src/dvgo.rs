@@ -11,6 +11,7 @@ use mb_neural::encoding::Frequencies;
 use mb_neural::model::{GROUPS, StepReport};
 use mb_neural::voxel_field::{ADAM, VoxelField, VoxelParameters, VoxelRates};
 use rand::RngExt as _;
+use rayon::prelude::*;
 
 use crate::context::{Buffer, Context, Work};
 use crate::encoding::Encoding;
@@ -18,7 +19,7 @@ use crate::frequencies::{Columns, encode_directions, encode_positions};
 use crate::kernels::Kernels;
 use crate::network::Network;
 use crate::on_device::Learner;
-use crate::rays::{RAY, Samples, Space, occupied, pack};
+use crate::rays::{Ahead, RAY, Rays, Samples, Space, occupied, pack};
 use crate::trained::AdamStep;
 
 /// One unit of the voxels' gradients, for a loss whose rays have this weight each. An almost empty grid has gradients of a
@@ -168,7 +169,9 @@ pub struct GpuDvgo {
     /// As marched, and without the dim ones.
     marched: Samples,
     bright: Samples,
+    rays: Buffer,
     losses: Buffer,
+    next: Ahead<Vec<[f32; RAY]>>,
 }
 
 fn voxels(context: &Context, twin: &Dvgo) -> Voxels {
@@ -186,7 +189,9 @@ impl GpuDvgo {
             free: occupied(c, &twin.free),
             marched: Samples::new(c),
             bright: Samples::new(c),
+            rays: c.zeros(0),
             losses: c.zeros(0),
+            next: Ahead::none(),
             twin,
             context,
         }
@@ -194,24 +199,25 @@ impl GpuDvgo {
 
     /// The rays of a step, as the twin draws them.
     fn draw(&self, data: &RayDataset, cameras: &CameraResiduals, step: u64) -> Vec<[f32; RAY]> {
-        let (twin, mut packed, mut rays) = (&self.twin, Vec::new(), Vec::new());
-        for group in 0..GROUPS as u64 {
-            let mut rng = rng(twin.options.seed, step * GROUPS as u64 + group);
-            data.draw(&mut rng, twin.rays_of_group(), cameras, &mut rays);
-            packed.extend(rays.iter().map(|target| {
+        let twin = &self.twin;
+        let groups = (0..GROUPS as u64).into_par_iter().map(|group| {
+            let (mut rng, mut targets) = (rng(twin.options.seed, step * GROUPS as u64 + group), Vec::new());
+            data.draw(&mut rng, twin.rays_of_group(), cameras, &mut targets);
+            let packed = targets.iter().map(|target| {
                 let background: [f32; 3] = std::array::from_fn(|_| rng.random());
                 let range = twin.range(&target.ray).map_or([0.0, -1.0], |(near, far)| [near, far]);
                 let wanted = target.before(background, twin.with_masks);
                 let mut ray = pack(target, rng.random(), background, wanted, range[0]);
                 ray[14..16].copy_from_slice(&range);
                 ray
-            }));
-        }
-        packed
+            });
+            packed.collect::<Vec<_>>()
+        });
+        groups.collect::<Vec<_>>().concat()
     }
 
     /// Samples of the rays, and those of them that are worth a colour.
-    fn sample(&mut self, rays: &Buffer, count: usize) -> Result<()> {
+    fn sample(&mut self, count: usize) -> Result<()> {
         let (context, k, twin) = (&*self.context, &self.kernels, &self.twin);
         let space = Space {
             resolution: twin.free.resolution(),
@@ -221,13 +227,13 @@ impl GpuDvgo {
             inside_ball: twin.with_masks,
             voxels: Some(twin.bounds),
         };
-        self.marched.march(context, k, &space, (rays, count), &self.free)?;
+        self.marched.march(context, k, &space, Rays { rays: &self.rays, count, occupied: &self.free })?;
         context.reserve(&mut self.field.raw, self.marched.len);
-        context.reserve(&mut self.bright.starts, count + 1);
+        context.reserve(&mut self.bright.counts, count);
         let (m, f) = (&self.marched, &self.field);
         let mut work = context.work();
         f.densities(&mut work, k, m);
-        let judged = [(2, &m.starts), (3, &m.steps), (4, &f.raw), (5, &self.bright.starts), (6, &m.stays)];
+        let judged = [(2, &m.starts), (3, &m.steps), (4, &f.raw), (5, &self.bright.counts), (6, &m.stays)];
         work.run(&k.count_bright, &self.sizes(count), &judged, count);
         work.submit();
         self.bright.keep(context, k, m, count, 0)
@@ -242,8 +248,8 @@ impl GpuDvgo {
     }
 
     /// Forward, loss, backward and Adam; the losses stay in `self.losses`.
-    fn learn(&mut self, rays: &Buffer, count: usize, step: u64) {
-        let context = &*self.context;
+    fn learn(&mut self, count: usize, step: u64) {
+        let (context, rays) = (&*self.context, &self.rays);
         self.field.reserve(context, self.bright.len);
         context.reserve(&mut self.losses, 2 * count);
         let (k, f, s) = (&self.kernels, &self.field, &self.bright);
@@ -284,11 +290,15 @@ impl Learner for GpuDvgo {
             self.twin.begin(step)?;
             self.send();
         }
-        let packed = self.draw(data, cameras, step);
-        let count = packed.len();
-        let rays = self.context.upload(packed.as_flattened());
-        self.sample(&rays, count)?;
-        self.learn(&rays, count, step);
+        let rays = self.next.take(step).unwrap_or_else(|| self.draw(data, cameras, step));
+        let count = rays.len();
+        self.context.replace(&mut self.rays, rays.as_flattened());
+        self.sample(count)?;
+        self.learn(count, step);
+        // While the device learns, the next rays are drawn, where they are of the same stage.
+        if !self.twin.is_replaced_at(step + 1) {
+            self.next.keep(step + 1, self.draw(data, cameras, step + 1));
+        }
         let losses: Vec<[f32; 2]> = self.context.read(&self.losses, count)?;
         let mean = |i: usize| losses.iter().map(|l| f64::from(l[i])).sum::<f64>() / count as f64;
         let (samples, lit) = (self.marched.len, self.bright.len);
@@ -300,6 +310,7 @@ impl Learner for GpuDvgo {
     }
 
     fn send(&mut self) {
+        self.next = Ahead::none();
         self.field = voxels(&self.context, &self.twin);
         self.free = occupied(&self.context, &self.twin.free);
     }

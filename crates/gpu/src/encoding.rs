@@ -136,14 +136,14 @@ impl Encoding {
 
     /// One Adam step, which clears `sums`.
     pub fn step(&self, work: &mut Work<'_>, k: &Kernels, unit: f32, step: &AdamStep) {
-        let gradient = Gradient { kernel: &k.adam_table, from: (4, &self.sums), scales: None, pieces: 0, unit };
+        let gradient = Gradient { kernel: &k.adam_table, from: (4, &self.sums), scales: None, unit };
         self.table.step(work, step, &gradient, self.table.len);
     }
 
     /// The same, with the rates of each entry scaled by its own factor.
     pub fn step_scaled(&self, work: &mut Work<'_>, k: &Kernels, unit: f32, step: &AdamStep, scales: &Buffer) {
         let scales = Some((scales, self.features));
-        let gradient = Gradient { kernel: &k.adam_scaled, from: (4, &self.sums), scales, pieces: 0, unit };
+        let gradient = Gradient { kernel: &k.adam_scaled, from: (4, &self.sums), scales, unit };
         self.table.step(work, step, &gradient, self.table.len);
     }
 }

@@ -101,8 +101,7 @@ impl Kernels {
             voxels,
         ] = SOURCES.map(|(_, source)| source);
         let kernel = |source, entry| context.kernel(source, entry, &[]);
-        let product =
-            |number, narrow| context.kernel(dense, "multiply", &[("product", number), ("narrow", narrow)]);
+        let product = |number, narrow| context.kernel(dense, "multiply", &[("product", number), ("narrow", narrow)]);
         let walk = |inside, voxels| {
             ["count", "place"].map(|entry| context.kernel(march, entry, &[("inside_ball", inside), ("voxels", voxels)]))
         };

@@ -130,12 +130,18 @@ fn gpu(_number: Option<usize>) -> Result<Box<dyn Device>> {
 
 #[cfg(feature = "wgpu")]
 fn first_gpu() -> Option<Box<dyn Device>> {
-    context::Context::first_hardware().map(|context| Box::new(Gpu(context.into())) as Box<dyn Device>)
+    context::Context::first_hardware().map(|context| on(context.into()))
 }
 
 #[cfg(feature = "wgpu")]
 fn gpu(number: Option<usize>) -> Result<Box<dyn Device>> {
-    Ok(Box::new(Gpu(context::Context::numbered(number)?.into())))
+    Ok(on(context::Context::numbered(number)?.into()))
+}
+
+/// The device of an open context.
+#[cfg(feature = "wgpu")]
+pub fn on(context: std::sync::Arc<context::Context>) -> Box<dyn Device> {
+    Box::new(Gpu(context))
 }
 
 /// An open GPU.

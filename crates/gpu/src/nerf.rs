@@ -10,13 +10,14 @@ use mb_neural::model::{GROUPS, StepReport};
 use mb_neural::nerf::{DARK, Nerf};
 use mb_neural::occupancy::{CELL_MEMORY, looks_everywhere};
 use rand::RngExt as _;
+use rayon::prelude::*;
 
-use crate::context::{Buffer, Context};
+use crate::context::{Buffer, Context, WORKGROUP};
 use crate::encoding::unit_of;
 use crate::kernels::Kernels;
 use crate::on_device::Learner;
 use crate::radiance::Radiance;
-use crate::rays::{RAY, Samples, Space, occupied, pack};
+use crate::rays::{Ahead, Rays, Samples, Space, occupied, pack};
 
 /// A NeRF whose twin holds all that is not of the device, and, after a fetch, all that the device has learned.
 pub struct GpuNerf {
@@ -25,9 +26,17 @@ pub struct GpuNerf {
     kernels: Kernels,
     field: Radiance,
     occupied: Buffer,
+    rays: Buffer,
     samples: Samples,
     weights: Buffer,
     losses: Buffer,
+    next: Ahead<Counted>,
+}
+
+/// Rays that the device has, and how many samples each has.
+struct Counted {
+    rays: usize,
+    counts: Vec<u32>,
 }
 
 impl GpuNerf {
@@ -38,28 +47,35 @@ impl GpuNerf {
             kernels: Kernels::new(c),
             field: Radiance::new(c, &twin.field, &twin.parameters, twin.options.occupancy),
             occupied: occupied(c, &twin.occupancy),
+            rays: c.zeros(0),
             samples: Samples::new(c),
             weights: c.zeros(0),
             losses: c.zeros(0),
+            next: Ahead::none(),
             twin,
             context,
         }
     }
 
-    /// The rays of a step, as the twin draws them.
-    fn draw(&self, data: &RayDataset, cameras: &CameraResiduals, step: u64) -> Vec<[f32; RAY]> {
-        let options = &self.twin.options;
-        let (mut packed, mut rays) = (Vec::new(), Vec::new());
-        for group in 0..GROUPS as u64 {
-            let mut rng = rng(options.seed, step * GROUPS as u64 + group);
-            data.draw(&mut rng, self.twin.rays_of_group(), cameras, &mut rays);
-            packed.extend(rays.iter().map(|target| {
+    /// Draws the rays of a step, as the twin does, and counts their samples; how many rays they are.
+    fn begin(&mut self, data: &RayDataset, cameras: &CameraResiduals, step: u64) -> usize {
+        let (options, rays) = (&self.twin.options, self.twin.rays_of_group());
+        let drawn = (0..GROUPS as u64).into_par_iter().map(|group| {
+            let (mut rng, mut targets) = (rng(options.seed, step * GROUPS as u64 + group), Vec::new());
+            data.draw(&mut rng, rays, cameras, &mut targets);
+            let packed = targets.iter().map(|target| {
                 let background: [f32; 3] = std::array::from_fn(|_| rng.random());
                 let wanted = target.before(background, options.object_only);
                 pack(target, rng.random(), background, wanted, options.near)
-            }));
-        }
-        packed
+            });
+            packed.collect::<Vec<_>>()
+        });
+        let drawn = drawn.collect::<Vec<_>>().concat();
+        let (context, space) = (&*self.context, self.space());
+        context.replace(&mut self.rays, drawn.as_flattened());
+        let rays = Rays { rays: &self.rays, count: drawn.len(), occupied: &self.occupied };
+        self.samples.count(context, &self.kernels, &space, rays);
+        drawn.len()
     }
 
     fn space(&self) -> Space {
@@ -68,13 +84,13 @@ impl GpuNerf {
     }
 
     /// Forward, loss, backward and Adam; the losses stay in `self.losses`.
-    fn learn(&mut self, rays: &Buffer, count: usize, lr: f32, t: u64) {
+    fn learn(&mut self, count: usize, lr: f32, t: u64) {
         let context = &*self.context;
         let n = self.samples.len;
         self.field.reserve(context, n);
         context.reserve(&mut self.weights, n);
         context.reserve(&mut self.losses, 2 * count);
-        let (k, f, s) = (&self.kernels, &self.field, &self.samples);
+        let (k, f, s, rays) = (&self.kernels, &self.field, &self.samples, &self.rays);
         let mut work = context.work();
         f.forward(&mut work, k, rays, s);
         let scale = 1.0 / (3 * count) as f32;
@@ -90,7 +106,7 @@ impl GpuNerf {
             (8, &f.d_color),
             (9, &self.losses),
         ];
-        work.run(&k.losses, &[count as u32, floats[0], floats[1], floats[2], 0], &losses, count);
+        work.run(&k.losses, &[count as u32, floats[0], floats[1], floats[2], 0], &losses, count * WORKGROUP);
         let unit = unit_of(scale);
         f.backward(&mut work, k, s, unit);
         f.step(&mut work, k, unit, lr, t);
@@ -123,23 +139,35 @@ impl Learner for GpuNerf {
     }
 
     fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
-        let packed = self.draw(data, cameras, step);
-        let count = packed.len();
-        let rays = self.context.upload(packed.as_flattened());
-        let space = self.space();
-        self.samples.march(&self.context, &self.kernels, &space, (&rays, count), &self.occupied)?;
+        let counted = match self.next.take(step) {
+            Some(counted) => counted,
+            None => {
+                let rays = self.begin(data, cameras, step);
+                Counted { rays, counts: self.context.read(&self.samples.counts, rays)? }
+            }
+        };
+        let (count, space) = (counted.rays, self.space());
+        let rays = Rays { rays: &self.rays, count, occupied: &self.occupied };
+        self.samples.place(&self.context, &self.kernels, &space, rays, &counted.counts);
         let options = &self.twin.options;
         let (lr, every) = (options.learning_rate * options.schedule.factor(step + 1), options.occupancy_every);
-        self.learn(&rays, count, lr, step + 1);
-        let losses: Vec<[f32; 2]> = self.context.read(&self.losses, count)?;
-        let sum = |i: usize| losses.iter().map(|l| f64::from(l[i])).sum::<f64>();
+        let samples = self.samples.len;
+        self.learn(count, lr, step + 1);
+        self.twin.count_samples(samples, count);
+        // While the device learns, the next rays are drawn; what is refreshed first counts their samples itself.
+        let refreshed = (step + 1).is_multiple_of(every);
+        let next = if refreshed { 0 } else { self.begin(data, cameras, step + 1) };
+        let mut found = self.context.read_all(&[(&self.losses, 2 * count), (&self.samples.counts, next)])?;
+        let counts = found.pop().unwrap_or_default();
+        let sum = |i: usize| found[0].iter().skip(i).step_by(2).map(|l| f64::from(f32::from_bits(*l))).sum::<f64>();
         let mse = sum(0) / (3 * count) as f64;
         let loss = mse + f64::from(self.twin.options.distortion) * sum(1) / count as f64;
-        self.twin.count_samples(self.samples.len, count);
-        if (step + 1).is_multiple_of(every) {
+        if refreshed {
             self.refresh_occupancy((step + 1) / every)?;
+        } else {
+            self.next.keep(step + 1, Counted { rays: next, counts });
         }
-        Ok(StepReport { loss, mse, rays: count, samples: self.samples.len, lit: self.samples.len })
+        Ok(StepReport { loss, mse, rays: count, samples, lit: samples })
     }
 
     fn fetch(&mut self) -> Result<()> {
@@ -148,6 +176,7 @@ impl Learner for GpuNerf {
     }
 
     fn send(&mut self) {
+        self.next = Ahead::none();
         let (context, twin) = (&*self.context, &self.twin);
         self.field = Radiance::new(context, &twin.field, &twin.parameters, twin.options.occupancy);
         self.occupied = occupied(context, &twin.occupancy);

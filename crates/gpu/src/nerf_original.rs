@@ -11,7 +11,7 @@ use mb_neural::model::{GROUPS, StepReport};
 use mb_neural::nerf_original::{ADAM, NerfOriginal, TILE_RAYS};
 use rand::RngExt as _;
 
-use crate::context::{Buffer, Context};
+use crate::context::{Buffer, Context, WORKGROUP};
 use crate::frequency_field::FrequencyNetworks;
 use crate::kernels::Kernels;
 use crate::on_device::Learner;
@@ -82,7 +82,7 @@ impl Pass {
             (8, &f.d_color),
             (9, &self.losses),
         ];
-        work.run(&k.losses, &sizes, &losses, count);
+        work.run(&k.losses, &sizes, &losses, count * WORKGROUP);
         f.backward(&mut work, k, s);
         work.submit();
     }

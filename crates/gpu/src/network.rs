@@ -38,9 +38,8 @@ struct Second {
 struct Gains {
     lengths: Trained,
     columns: Buffer,
-    /// The weights in use, their gradient, and that of the lengths.
+    /// The weights in use, and the gradient of the lengths.
     weights: Buffer,
-    d_weights: Buffer,
     d_lengths: Buffer,
 }
 
@@ -54,6 +53,8 @@ pub struct Network {
     /// `[pieces, parameters]`: sums of the gradient.
     pub partial_sums: Buffer,
     pieces: usize,
+    /// `[parameters]`: all of them.
+    d_weights: Buffer,
     /// `[samples, padded(inputs)]`, by [`Self::gradient`].
     pub gradient: Buffer,
 }
@@ -63,9 +64,9 @@ const PIECES: usize = 1024;
 const PARTIAL_SUMS: usize = 1 << 25;
 const PIECE: usize = 256;
 
-/// Threads for a product of this size: a workgroup for each tile of 64 x 64, or of 256 x 16.
+/// Threads for a product of this size: a workgroup for each tile of 64 x 64, or of 128 x 16.
 fn threads_of(height: usize, width: usize, narrow: bool) -> usize {
-    let [tall, wide] = if narrow { [256, 16] } else { [64, 64] };
+    let [tall, wide] = if narrow { [128, 16] } else { [64, 64] };
     height.div_ceil(tall) * width.div_ceil(wide) * WORKGROUP
 }
 
@@ -109,7 +110,6 @@ impl Network {
             lengths: Trained::new(context, lengths),
             columns: context.upload(&columns),
             weights: context.zeros(twin.direct().values.len()),
-            d_weights: context.zeros(twin.direct().values.len()),
             d_lengths: context.zeros(lengths.values.len()),
         });
         let mut work = context.work();
@@ -155,6 +155,7 @@ impl Network {
             activation: shape.activation,
             parameters: Trained::new(context, parameters),
             gains: None,
+            d_weights: context.zeros(parameters.values.len()),
             partial_sums: none(),
             pieces: 0,
             gradient: none(),
@@ -264,17 +265,7 @@ impl Network {
         let layer = &self.layers[i];
         let (kernel, narrow) = product_of(&k.input_gradient, layer.inputs);
         let threads = threads_of(rows, layer.inputs, narrow);
-        let p = Product {
-            kernel,
-            x,
-            z,
-            dx,
-            activated: i > 0,
-            tangent: false,
-            unit: false,
-            out_scale: 1.0,
-            threads,
-        };
+        let p = Product { kernel, x, z, dx, activated: i > 0, tangent: false, unit: false, out_scale: 1.0, threads };
         self.product(work, layer, rows, &p);
     }
 
@@ -418,26 +409,26 @@ impl Network {
 
     /// One Adam step, with all that was added since the last one, and the weights that follow from it.
     pub fn step(&self, work: &mut Work<'_>, k: &Kernels, step: &AdamStep) {
-        let gradient =
-            |sums, pieces| Gradient { kernel: &k.adam_network, from: (5, sums), scales: None, pieces, unit: 0.0 };
+        let gradient = |sums| Gradient { kernel: &k.adam_network, from: (5, sums), scales: None, unit: 0.0 };
         let len = self.parameters.len;
+        let summed = [(4, &self.partial_sums), (5, &self.d_weights)];
+        // Eight threads for each parameter.
+        work.run(&k.sum_up, &[0, len as u32, self.pieces as u32], &summed, 8 * len);
         let Some(gains) = &self.gains else {
-            self.parameters.step(work, step, &gradient(&self.partial_sums, self.pieces), len);
+            self.parameters.step(work, step, &gradient(&self.d_weights), len);
             return;
         };
-        let summed = [(4, &self.partial_sums), (5, &gains.d_weights)];
-        work.run(&k.sum_up, &[0, len as u32, self.pieces as u32], &summed, len);
         let lengths = &gains.lengths;
         let sent = [
             (1, &gains.columns),
             (2, &self.parameters.values),
             (3, &lengths.values),
-            (5, &gains.d_weights),
+            (5, &self.d_weights),
             (6, &gains.d_lengths),
         ];
         work.run(&k.send_to_lengths, &[lengths.len as u32, 0, 0], &sent, lengths.len);
-        self.parameters.step(work, step, &gradient(&gains.d_weights, 1), len);
-        lengths.step(work, step, &gradient(&gains.d_lengths, 1), lengths.len);
+        self.parameters.step(work, step, &gradient(&self.d_weights), len);
+        lengths.step(work, step, &gradient(&gains.d_lengths), lengths.len);
         self.normalise(work, k);
     }
 

@@ -5,19 +5,20 @@ use std::sync::Arc;
 
 use mb_job::{Result, rng};
 use mb_neural::cameras::CameraResiduals;
-use mb_neural::dataset::RayDataset;
+use mb_neural::dataset::{RayDataset, TargetRay};
 use mb_neural::model::{GROUPS, StepReport};
 use mb_neural::neus::{DARK, FREE_POINTS, Neus, SHORTEST_OUTER_STEP, nearness};
 use mb_neural::occupancy::{CELL_MEMORY, looks_everywhere};
 use mb_neural::radiance_field::ADAM;
 use rand::RngExt as _;
+use rayon::prelude::*;
 
 use crate::context::{Buffer, Context};
 use crate::encoding::unit_of;
 use crate::kernels::Kernels;
 use crate::on_device::Learner;
 use crate::radiance::Radiance;
-use crate::rays::{RAY, Samples, Space, occupied, pack};
+use crate::rays::{Ahead, RAY, Rays, Samples, Space, occupied, pack};
 use crate::surface::Surface;
 use crate::trained::AdamStep;
 
@@ -34,7 +35,9 @@ pub struct GpuNeus {
     marched: Samples,
     inner: Samples,
     outer: Samples,
+    rays: Buffer,
     losses: Buffer,
+    next: Ahead<Drawn>,
 }
 
 /// What a step is given: the rays, and the points of the ball that belong to none.
@@ -59,7 +62,9 @@ impl GpuNeus {
             marched: Samples::new(c),
             inner: Samples::new(c),
             outer: Samples::new(c),
+            rays: c.zeros(0),
             losses: c.zeros(0),
+            next: Ahead::none(),
             twin,
             context,
         }
@@ -67,28 +72,37 @@ impl GpuNeus {
 
     /// Rays and free points of a step, as the twin draws them.
     fn draw(&self, data: &RayDataset, cameras: &CameraResiduals, step: u64) -> Drawn {
-        let (twin, mut rays) = (&self.twin, Vec::new());
+        let twin = &self.twin;
+        let groups: Vec<Drawn> = (0..GROUPS as u64)
+            .into_par_iter()
+            .map(|group| {
+                let (mut rng, mut targets) = (rng(twin.options.seed, step * GROUPS as u64 + group), Vec::new());
+                data.draw(&mut rng, twin.rays_of_group(), cameras, &mut targets);
+                let pack = |target: &TargetRay| {
+                    let background =
+                        if twin.with_masks { [0.0; 3] } else { std::array::from_fn(|_| rng.random::<f32>()) };
+                    let mask = target.mask.filter(|_| twin.with_masks);
+                    let wanted = target.rgb.map(|c| c * mask.unwrap_or(1.0));
+                    let ball = target.ray.ball(1.0);
+                    let mut ray = pack(target, rng.random(), background, wanted, Neus::outer_start(ball));
+                    [ray[14], ray[15]] = ball.map_or([0.0, -1.0], |(near, far)| [near, far]);
+                    ray[16] = mask.unwrap_or(-1.0);
+                    ray
+                };
+                let rays = targets.iter().map(pack).collect();
+                let point = |_| std::array::from_fn(|_| 0.5 * rng.random_range(-1.0..1.0f32) + 0.5);
+                Drawn { rays, free: (0..FREE_POINTS).map(point).collect() }
+            })
+            .collect();
         let mut drawn = Drawn { rays: Vec::new(), free: Vec::new() };
-        for group in 0..GROUPS as u64 {
-            let mut rng = rng(twin.options.seed, step * GROUPS as u64 + group);
-            data.draw(&mut rng, twin.rays_of_group(), cameras, &mut rays);
-            drawn.rays.extend(rays.iter().map(|target| {
-                let background = if twin.with_masks { [0.0; 3] } else { std::array::from_fn(|_| rng.random::<f32>()) };
-                let mask = target.mask.filter(|_| twin.with_masks);
-                let wanted = target.rgb.map(|c| c * mask.unwrap_or(1.0));
-                let ball = target.ray.ball(1.0);
-                let mut ray = pack(target, rng.random(), background, wanted, Neus::outer_start(ball));
-                [ray[14], ray[15]] = ball.map_or([0.0, -1.0], |(near, far)| [near, far]);
-                ray[16] = mask.unwrap_or(-1.0);
-                ray
-            }));
-            let points = (0..FREE_POINTS).map(|_| std::array::from_fn(|_| 0.5 * rng.random_range(-1.0..1.0f32) + 0.5));
-            drawn.free.extend(points);
+        for group in groups {
+            drawn.rays.extend(group.rays);
+            drawn.free.extend(group.free);
         }
         drawn
     }
 
-    fn march(&mut self, rays: &Buffer, count: usize) -> Result<()> {
+    fn march(&mut self, count: usize) -> Result<()> {
         let o = &self.twin.options;
         let inside = Space {
             resolution: o.occupancy,
@@ -98,11 +112,12 @@ impl GpuNeus {
             inside_ball: true,
             voxels: None,
         };
-        let (context, k) = (&*self.context, &self.kernels);
-        self.marched.march(context, k, &inside, (rays, count), &self.inner_cells)?;
+        let (context, k, rays) = (&*self.context, &self.kernels, &self.rays);
+        let passing = |occupied| Rays { rays, count, occupied };
+        self.marched.march(context, k, &inside, passing(&self.inner_cells))?;
         if !self.twin.with_masks {
             let behind = Space { step: SHORTEST_OUTER_STEP, cone: o.background_cone, inside_ball: false, ..inside };
-            self.outer.march(context, k, &behind, (rays, count), &self.outer_cells)?;
+            self.outer.march(context, k, &behind, passing(&self.outer_cells))?;
         }
         Ok(())
     }
@@ -111,12 +126,12 @@ impl GpuNeus {
     fn keep(&mut self, count: usize, free: &[[f32; 3]]) -> Result<()> {
         let (context, k, m) = (&*self.context, &self.kernels, &self.marched);
         self.surface.reserve(context, m.len);
-        context.reserve(&mut self.inner.starts, count + 1);
+        context.reserve(&mut self.inner.counts, count);
         let stride = self.surface.geometry.out_stride() as u32;
         let sizes = [count as u32, self.twin.sharpness().to_bits(), DARK.to_bits(), stride];
         let mut work = context.work();
         self.surface.distance(&mut work, k, m.points(m.len));
-        let judged = [(1, &m.starts), (2, self.surface.geometry.out()), (3, &self.inner.starts), (9, &m.stays)];
+        let judged = [(1, &m.starts), (2, self.surface.geometry.out()), (3, &self.inner.counts), (9, &m.stays)];
         work.run(&k.count_kept, &sizes, &judged, count);
         work.submit();
         self.inner.keep(context, k, m, count, free.len())?;
@@ -125,8 +140,8 @@ impl GpuNeus {
     }
 
     /// Forward, loss, backward and Adam; the losses stay in `self.losses`.
-    fn learn(&mut self, rays: &Buffer, count: usize, free: usize, step: u64) {
-        let context = &*self.context;
+    fn learn(&mut self, count: usize, free: usize, step: u64) {
+        let (context, rays) = (&*self.context, &self.rays);
         let (n, rows) = (self.inner.len, self.inner.len + free);
         self.surface.reserve(context, rows);
         self.outside.reserve(context, self.outer.len);
@@ -221,17 +236,19 @@ impl Learner for GpuNeus {
     fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
         self.twin.set_levels(step);
         self.surface.set_levels(self.twin.field.active_levels);
-        let Drawn { rays: packed, free } = self.draw(data, cameras, step);
-        let count = packed.len();
-        let rays = self.context.upload(packed.as_flattened());
-        self.march(&rays, count)?;
+        let Drawn { rays, free } = self.next.take(step).unwrap_or_else(|| self.draw(data, cameras, step));
+        let count = rays.len();
+        self.context.replace(&mut self.rays, rays.as_flattened());
+        self.march(count)?;
         self.keep(count, &free)?;
-        self.learn(&rays, count, free.len(), step);
+        self.learn(count, free.len(), step);
+        self.twin.count_samples(self.marched.len, count);
+        // While the device learns, the next rays are drawn.
+        self.next.keep(step + 1, self.draw(data, cameras, step + 1));
         let losses: Vec<[f32; 4]> = self.context.read(&self.losses, count)?;
         let sum = |i: usize| losses.iter().map(|l| f64::from(l[i])).sum::<f64>();
         let (mse, loss) = (sum(0) / (3 * count) as f64, sum(1) / count as f64);
         self.twin.step_sharpness(sum(2) as f32, step + 1);
-        self.twin.count_samples(self.marched.len, count);
         let every = self.twin.options.occupancy_every;
         if (step + 1).is_multiple_of(every) {
             self.refresh_cells((step + 1) / every)?;
@@ -248,6 +265,7 @@ impl Learner for GpuNeus {
     }
 
     fn send(&mut self) {
+        self.next = Ahead::none();
         let (context, twin) = (&*self.context, &self.twin);
         self.surface = Surface::new(context, &self.kernels, &twin.field);
         self.outside = Radiance::new(context, &twin.outside, &twin.outside_parameters, twin.options.occupancy);

@@ -2,6 +2,7 @@
 
 use mb_job::Result;
 use mb_neural::radiance_field::{ADAM, RadianceField, RadianceParameters};
+use rayon::prelude::*;
 
 use crate::context::{Buffer, Context, Work};
 use crate::encoding::{Encoding, Points};
@@ -90,7 +91,7 @@ impl Radiance {
         self.density_of(work, k, s.points(n));
         work.run(&k.note, &self.sizes(n), &[(3, &s.positions), (6, &self.sigma), (7, &self.seen)], n);
         let split = [(1, rays), (2, &s.ray_of), (4, self.density.out()), (5, &self.color_in)];
-        work.run(&k.split, &self.sizes(n), &split, n);
+        work.run(&k.split, &self.sizes(n), &split, 8 * n);
         self.color.forward(work, k, &self.color_in, n);
     }
 
@@ -99,7 +100,7 @@ impl Radiance {
         let n = s.len;
         self.color.backward(work, k, &self.color_in, &self.d_color, n);
         let join = [(4, &self.d_geometry), (5, self.color.d_input()), (6, &self.d_density)];
-        work.run(&k.join, &self.sizes(n), &join, n);
+        work.run(&k.join, &self.sizes(n), &join, 16 * n);
         self.density.backward(work, k, &self.features, &self.d_geometry, n);
         self.encoding.scatter(work, k, s.points(n), self.density.d_input(), unit);
     }
@@ -135,11 +136,14 @@ impl Radiance {
     /// # Errors
     /// As [`Context::read`].
     pub fn seen(&self, context: &Context) -> Result<Vec<(u32, f32)>> {
-        let seen: Vec<f32> = context.read(&self.seen, self.resolution.pow(3))?;
+        let seen = context.read_with(&self.seen, self.resolution.pow(3), |seen: &[f32]| {
+            let seen = (0..seen.len() as u32).into_par_iter().zip(seen);
+            seen.filter(|(_, v)| **v > 0.0).map(|(cell, v)| (cell, *v)).collect()
+        })?;
         let mut work = context.work();
         work.clear(&self.seen);
         work.submit();
-        Ok((0..).zip(seen).filter(|(_, v)| *v > 0.0).collect())
+        Ok(seen)
     }
 
     /// Brings what was learned to the twin.

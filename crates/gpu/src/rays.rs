@@ -4,8 +4,9 @@ use mb_job::Result;
 use mb_neural::dataset::TargetRay;
 use mb_neural::dvgo::UnitBox;
 use mb_neural::occupancy::OccupancyGrid;
+use rayon::prelude::*;
 
-use crate::context::{Buffer, Context};
+use crate::context::{Buffer, Context, Kernel, WORKGROUP};
 use crate::encoding::Points;
 use crate::kernels::Kernels;
 
@@ -38,9 +39,10 @@ pub fn starts(counts: &[u32]) -> Vec<u32> {
     out
 }
 
-/// The cells that may hold something, as `march.wgsl` reads them.
+/// The cells that may hold something, as `march.wgsl` reads them: a bit each.
 pub fn occupied(context: &Context, cells: &OccupancyGrid) -> Buffer {
-    context.upload(&cells.occupied().iter().map(|o| u32::from(*o)).collect::<Vec<_>>())
+    let word = |cells: &[bool]| cells.iter().rev().fold(0, |word, occupied| word << 1 | u32::from(*occupied));
+    context.upload(&cells.occupied().par_chunks(32).map(word).collect::<Vec<_>>())
 }
 
 /// Where rays are sampled; see `march.wgsl`.
@@ -60,8 +62,60 @@ pub struct Space {
     pub voxels: Option<UnitBox>,
 }
 
+impl Space {
+    /// `count` and `place` of march.wgsl.
+    fn kernels<'a>(&self, k: &'a Kernels) -> &'a [Kernel; 2] {
+        match (self.voxels.is_some(), self.inside_ball) {
+            (false, false) => &k.contracted,
+            (false, true) => &k.inside_ball,
+            (true, false) => &k.voxels,
+            (true, true) => &k.voxels_inside,
+        }
+    }
+
+    /// What both are told.
+    fn sizes(&self, rays: usize) -> Vec<u32> {
+        let bounds = self.voxels.unwrap_or(UnitBox::ALL);
+        let floats = [self.far, self.step, self.cone].into_iter().chain(bounds.low).chain(bounds.high);
+        [rays as u32, self.resolution as u32].into_iter().chain(floats.map(f32::to_bits)).collect()
+    }
+}
+
+/// Rays, and the cells that they pass.
+#[derive(Clone, Copy)]
+pub struct Rays<'a> {
+    /// `[count, 20]`, at least.
+    pub rays: &'a Buffer,
+    /// How many.
+    pub count: usize,
+    /// By [`occupied`].
+    pub occupied: &'a Buffer,
+}
+
+/// What the next step is given, drawn while the device works on this one.
+pub struct Ahead<T>(Option<(u64, T)>);
+
+impl<T> Ahead<T> {
+    /// Nothing.
+    pub fn none() -> Self {
+        Self(None)
+    }
+
+    /// Keeps what a step is given.
+    pub fn keep(&mut self, step: u64, drawn: T) {
+        self.0 = Some((step, drawn));
+    }
+
+    /// What was kept for this step, if it was.
+    pub fn take(&mut self, step: u64) -> Option<T> {
+        self.0.take().filter(|(kept, _)| *kept == step).map(|(_, drawn)| drawn)
+    }
+}
+
 /// Samples of rays, one ray after the other.
 pub struct Samples {
+    /// `[rays]`: how many samples each ray has, as a kernel counted them.
+    pub counts: Buffer,
     /// `[rays + 1]`: where each ray's samples begin.
     pub starts: Buffer,
     /// `[samples, 3]`: position in the unit cube.
@@ -80,7 +134,7 @@ impl Samples {
     /// None.
     pub fn new(context: &Context) -> Self {
         let none = || context.zeros(0);
-        Self { starts: none(), positions: none(), steps: none(), ray_of: none(), stays: none(), len: 0 }
+        Self { counts: none(), starts: none(), positions: none(), steps: none(), ray_of: none(), stays: none(), len: 0 }
     }
 
     /// The first `count` of them, or, where more positions lie behind them, with these.
@@ -100,51 +154,57 @@ impl Samples {
     ///
     /// # Errors
     /// As [`Context::read`].
-    pub fn march(
-        &mut self,
-        context: &Context,
-        k: &Kernels,
-        space: &Space,
-        (rays, count): (&Buffer, usize),
-        occupied: &Buffer,
-    ) -> Result<()> {
-        let mut sizes = vec![count as u32, space.resolution as u32];
-        sizes.extend([space.far, space.step, space.cone].map(f32::to_bits));
-        let bounds = space.voxels.unwrap_or(UnitBox::ALL);
-        sizes.extend(bounds.low.iter().chain(&bounds.high).map(|c| c.to_bits()));
-        let [counting, placing] = match (space.voxels.is_some(), space.inside_ball) {
-            (false, false) => &k.contracted,
-            (false, true) => &k.inside_ball,
-            (true, false) => &k.voxels,
-            (true, true) => &k.voxels_inside,
-        };
-        context.reserve(&mut self.starts, count + 1);
-        let mut work = context.work();
-        work.run(counting, &sizes, &self.marched(rays, occupied), count);
-        work.submit();
-        self.add_up(context, count, 0)?;
-        let mut work = context.work();
-        work.run(placing, &sizes, &self.marched(rays, occupied), count);
-        work.submit();
+    pub fn march(&mut self, context: &Context, k: &Kernels, space: &Space, rays: Rays<'_>) -> Result<()> {
+        self.count(context, k, space, rays);
+        let counts = context.read(&self.counts, rays.count)?;
+        self.place(context, k, space, rays, &counts);
         Ok(())
     }
 
-    /// From the number of each ray's samples, in `starts`: where they begin; makes room for them, and for `more` behind them.
-    fn add_up(&mut self, context: &Context, count: usize, more: usize) -> Result<()> {
-        let begins = starts(&context.read(&self.starts, count)?);
-        self.len = begins[count] as usize;
-        self.starts = context.upload(&begins);
+    /// The first half of [`Self::march`]: how many samples each ray has, in `counts`. Leaves the samples as they are.
+    pub fn count(&mut self, context: &Context, k: &Kernels, space: &Space, rays: Rays<'_>) {
+        context.reserve(&mut self.counts, rays.count);
+        let [counting, _] = space.kernels(k);
+        self.walk(context, counting, space, rays, &self.counts);
+    }
+
+    /// The second half: the samples, of which each ray has so many.
+    pub fn place(&mut self, context: &Context, k: &Kernels, space: &Space, rays: Rays<'_>, counts: &[u32]) {
+        self.add_up(context, counts, 0);
+        let [_, placing] = space.kernels(k);
+        self.walk(context, placing, space, rays, &self.starts);
+    }
+
+    fn walk(&self, context: &Context, kernel: &Kernel, space: &Space, rays: Rays<'_>, starts: &Buffer) {
+        let buffers = [
+            (1, rays.rays),
+            (2, rays.occupied),
+            (3, starts),
+            (4, &self.positions),
+            (5, &self.steps),
+            (6, &self.ray_of),
+        ];
+        let mut work = context.work();
+        work.run(kernel, &space.sizes(rays.count), &buffers, rays.count * WORKGROUP);
+        work.submit();
+    }
+
+    /// From the number of each ray's samples: where they begin, in `starts`; makes room for them, and for `more` behind them.
+    fn add_up(&mut self, context: &Context, counts: &[u32], more: usize) {
+        let begins = starts(counts);
+        self.len = begins[counts.len()] as usize;
+        context.replace(&mut self.starts, &begins);
         self.reserve(context, self.len + more);
-        Ok(())
     }
 
-    /// Becomes the samples of `all` that stay, with room for `more` behind them. `starts` has the number that stay of each
+    /// Becomes the samples of `all` that stay, with room for `more` behind them. `counts` has the number that stay of each
     /// of the `count` rays.
     ///
     /// # Errors
     /// As [`Context::read`].
     pub fn keep(&mut self, context: &Context, k: &Kernels, all: &Samples, count: usize, more: usize) -> Result<()> {
-        self.add_up(context, count, more)?;
+        let counts: Vec<u32> = context.read(&self.counts, count)?;
+        self.add_up(context, &counts, more);
         let mut work = context.work();
         let moved = [
             (1, &all.starts),
@@ -159,10 +219,5 @@ impl Samples {
         work.run(&k.compact, &[count as u32, 0, 0, 0], &moved, count);
         work.submit();
         Ok(())
-    }
-
-    /// What both entry points of march.wgsl read and write.
-    fn marched<'a>(&'a self, rays: &'a Buffer, occupied: &'a Buffer) -> [(u32, &'a Buffer); 6] {
-        [(1, rays), (2, occupied), (3, &self.starts), (4, &self.positions), (5, &self.steps), (6, &self.ray_of)]
     }
 }

@@ -36,8 +36,6 @@ pub struct Gradient<'a> {
     pub from: (u32, &'a Buffer),
     /// Factors of the rate, each for so many numbers.
     pub scales: Option<(&'a Buffer, u32)>,
-    /// Sums of a network's.
-    pub pieces: usize,
     /// Unit of a table's.
     pub unit: f32,
 }
@@ -66,7 +64,7 @@ impl Trained {
         let left = |beta: f32| (1.0 - f64::from(beta).powf(step.t as f64)) as f32;
         let rate = step.lr / left(beta1);
         let floats = [beta1, beta2, rate, 1.0 / left(beta2).sqrt(), epsilon, gradient.unit].map(f32::to_bits);
-        let mut sizes = vec![self.len as u32, gradient.pieces as u32];
+        let mut sizes = vec![self.len as u32];
         sizes.extend(floats);
         sizes.push(gradient.scales.map_or(0, |(_, width)| width));
         let mut buffers = vec![(1, &self.values), (2, &self.m), (3, &self.v), gradient.from];

@@ -175,8 +175,15 @@ impl OccupancyGrid {
 
     /// Mean of the open cells that have been looked at; infinite before the first look.
     pub fn mean(&self) -> f32 {
-        let open = self.values.iter().zip(&self.closed).filter(|(v, closed)| v.is_finite() && !**closed);
-        let (sum, n) = open.fold((0.0, 0), |(s, n), (v, _)| (s + f64::from(*v), n + 1));
+        let pieces = self.values.par_chunks(PIECE).zip(self.closed.par_chunks(PIECE));
+        let sums: Vec<(f64, u32)> = pieces
+            .map(|(values, closed)| {
+                let open = values.iter().zip(closed).filter(|(v, closed)| v.is_finite() && !**closed);
+                open.fold((0.0, 0), |(s, n), (v, _)| (s + f64::from(*v), n + 1))
+            })
+            .collect();
+        // In one order, whatever the threads do.
+        let (sum, n) = sums.iter().fold((0.0, 0), |(s, n), (sum, count)| (s + sum, n + count));
         if n == 0 { f32::INFINITY } else { (sum / f64::from(n)) as f32 }
     }
 

@@ -134,14 +134,11 @@ pub fn train(
         let report = model.step(data, cameras, step).map_err(|e| kept(e, run))?;
         step += 1;
         window.add(&report);
-        let point_due = step.is_multiple_of(run.report_every.max(1)) || step == total;
-        if point_due {
-            model.fetch().map_err(|e| kept(e, run))?;
+        if !report.loss.is_finite() {
+            return Err(diverged(step, "the loss is no longer finite", run));
         }
-        if !report.loss.is_finite() || (point_due && !model.is_finite()) {
-            return Err(diverged(step, "a number is no longer finite", run));
-        }
-        if point_due {
+        let due = |every: u64| step == total || step.is_multiple_of(every.max(1));
+        if due(run.report_every) {
             let point = window.point(step, clock.elapsed().as_secs_f64());
             window = Window::default();
             if point.samples_per_ray == 0.0 {
@@ -160,11 +157,14 @@ pub fn train(
         }
         progress.report(&what, step as usize, total as usize);
         let stop = progress.stop_requested();
-        let due = |every: u64| step == total || step.is_multiple_of(every.max(1));
         let checkpoint = run.checkpoint.as_ref().filter(|_| stop || due(run.checkpoint_every));
         let previews = run.previews.as_ref().filter(|_| due(run.preview_every));
-        if checkpoint.is_some() || previews.is_some() {
+        // What a device has learned is brought here only where somebody needs it.
+        if checkpoint.is_some() || previews.is_some() || step == total {
             model.fetch().map_err(|e| kept(e, run))?;
+            if !model.is_finite() {
+                return Err(diverged(step, "a parameter is no longer finite", run));
+            }
         }
         if let Some(path) = checkpoint {
             let mut buffers = model.buffers();

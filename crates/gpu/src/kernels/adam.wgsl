@@ -2,8 +2,6 @@
 
 struct Sizes {
     parameters: u32,
-    // `network`: partial sums of the gradient.
-    pieces: u32,
     beta1: f32,
     beta2: f32,
     // lr / (1 - beta1^t).
@@ -23,8 +21,8 @@ var<immediate> sizes: Sizes;
 @group(0) @binding(3) var<storage, read_write> v: array<f32>;
 // Gradient as whole numbers of 64 bits, low word first; cleared.
 @group(0) @binding(4) var<storage, read_write> sums: array<vec2<u32>>;
-// [pieces, parameters]; cleared.
-@group(0) @binding(5) var<storage, read_write> partial_sums: array<f32>;
+// [parameters]: gradient of a network.
+@group(0) @binding(5) var<storage, read> gradient: array<f32>;
 // [entries]: factors of the rate.
 @group(0) @binding(6) var<storage, read> scales: array<f32>;
 
@@ -96,14 +94,7 @@ fn scaled(
 @compute @workgroup_size(64)
 fn network(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     let i = id.y * groups.x * 64u + id.x;
-    if i >= sizes.parameters {
-        return;
+    if i < sizes.parameters {
+        update(i, gradient[i], sizes.rate);
     }
-    var g = 0.0;
-    for (var piece = 0u; piece < sizes.pieces; piece += 1u) {
-        let at = piece * sizes.parameters + i;
-        g += partial_sums[at];
-        partial_sums[at] = 0.0;
-    }
-    update(i, g, sizes.rate);
 }

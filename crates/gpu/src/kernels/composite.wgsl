@@ -1,5 +1,5 @@
 // Compositing, the loss of each ray and the derivatives. Twin: `composite`, `distortion` and `composite_backward`, which
-// explain the formulas. One thread for each ray.
+// explain the formulas. A workgroup for each ray, whose threads take its samples 64 at a time.
 
 struct Sizes {
     rays: u32,
@@ -54,9 +54,63 @@ fn rgb_of(i: u32) -> vec3<f32> {
     return 1.0 / (1.0 + exp(-vec3(color[8u * i], color[8u * i + 1u], color[8u * i + 2u])));
 }
 
+// Two lines, of which a scan reads one and writes the other.
+var<workgroup> line: array<vec2<f32>, 128>;
+
+// What comes before a thread's own, and all together.
+struct Scan {
+    before: vec2<f32>,
+    all: vec2<f32>,
+}
+
+// `thread` says where in the line it stands.
+fn sums(thread: u32, own: vec2<f32>) -> Scan {
+    line[thread] = own;
+    workgroupBarrier();
+    var half = 0u;
+    for (var reach = 1u; reach < 64u; reach *= 2u) {
+        var sum = line[half + thread];
+        if thread >= reach {
+            sum += line[half + thread - reach];
+        }
+        half = 64u - half;
+        line[half + thread] = sum;
+        workgroupBarrier();
+    }
+    let found = Scan(select(vec2(0.0), line[half + max(thread, 1u) - 1u], thread > 0u), line[half + 63u]);
+    workgroupBarrier();
+    return found;
+}
+
+fn products(thread: u32, own: f32) -> Scan {
+    line[thread] = vec2(own);
+    workgroupBarrier();
+    var half = 0u;
+    for (var reach = 1u; reach < 64u; reach *= 2u) {
+        var product = line[half + thread];
+        if thread >= reach {
+            product *= line[half + thread - reach];
+        }
+        half = 64u - half;
+        line[half + thread] = product;
+        workgroupBarrier();
+    }
+    let found = Scan(select(vec2(1.0), line[half + max(thread, 1u) - 1u], thread > 0u), line[half + 63u]);
+    workgroupBarrier();
+    return found;
+}
+
+// The light behind the samples that count, and where they end.
+var<workgroup> left: f32;
+var<workgroup> end: atomic<u32>;
+
 @compute @workgroup_size(64)
-fn losses_of_rays(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let ray = id.y * groups.x * 64u + id.x;
+fn losses_of_rays(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let ray = group.y * groups.x + group.x;
     if ray >= sizes.rays {
         return;
     }
@@ -69,64 +123,110 @@ fn losses_of_rays(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_wor
     // Front to back. Distances count in units that shrink like disparity, s = t / (1 + t).
     var light = 1.0;
     var sum = vec3(0.0);
-    var total = 0.0;
-    var moment = 0.0;
-    var end = first;
-    while end < last && light >= sizes.dark {
-        let alpha = opacity(end);
-        let w = light * alpha;
-        weights[end] = w;
-        // What reaches the sample is kept here until it is overwritten.
-        d_color[8u * end] = light;
-        sum += w * rgb_of(end);
-        total += w;
-        moment += w * steps[end].x / (1.0 + steps[end].x);
-        light *= 1.0 - alpha;
-        end += 1u;
+    var total_and_moment = vec2(0.0);
+    var until = last;
+    if thread == 0u {
+        atomicStore(&end, last);
     }
-    let error = sum + light * background - wanted;
+    for (var chunk = first; chunk < until; chunk += 64u) {
+        let i = chunk + thread;
+        var alpha = 0.0;
+        if i < last {
+            alpha = opacity(i);
+        }
+        let passed = products(thread, 1.0 - alpha);
+        let reach = light * passed.before.x;
+        // The first that too little light reaches is the end.
+        if i < last && reach < sizes.dark {
+            atomicMin(&end, i);
+        }
+        workgroupBarrier();
+        until = atomicLoad(&end);
+        if i == until {
+            left = reach;
+        }
+        workgroupBarrier();
+        if i < until {
+            let w = reach * alpha;
+            weights[i] = w;
+            // What reaches the sample is kept here until it is overwritten.
+            d_color[8u * i] = reach;
+            sum += w * rgb_of(i);
+            total_and_moment += w * vec2(1.0, steps[i].x / (1.0 + steps[i].x));
+        }
+        light = light * passed.all.x;
+        if until < chunk + 64u && until < last {
+            light = left;
+        }
+    }
+    let red_and_green = sums(thread, sum.xy).all;
+    let blue = sums(thread, vec2(sum.z, 0.0)).all.x;
+    let all = sums(thread, total_and_moment).all;
+    let error = vec3(red_and_green, blue) + light * background - wanted;
 
-    var before = 0.0;
-    var moment_before = 0.0;
+    // The distortion of a sample's weight against all others.
+    var before = vec2(0.0);
     var value = 0.0;
-    for (var i = first; i < end; i += 1u) {
-        let w = weights[i];
-        let stretch = 1.0 + steps[i].x;
-        let s = steps[i].x / stretch;
-        let length = steps[i].y / (stretch * stretch);
-        let pairs = s * before - moment_before + (moment - moment_before - w * s) - s * (total - before - w);
+    for (var chunk = first; chunk < until; chunk += 64u) {
+        let i = chunk + thread;
+        var w = 0.0;
+        var place = vec2(0.0);
+        if i < until {
+            w = weights[i];
+            place = steps[i];
+        }
+        let stretch = 1.0 + place.x;
+        let s = place.x / stretch;
+        let length = place.y / (stretch * stretch);
+        let scan = sums(thread, w * vec2(1.0, s));
+        let here = before + scan.before;
+        let pairs = s * here.x - here.y + (all.y - here.y - w * s) - s * (all.x - here.x - w);
         value += w * pairs + w * w * length / 3.0;
-        d_density[i] = 6.0 * sizes.scale * sizes.distortion * (pairs + w * length / 3.0);
-        before += w;
-        moment_before += w * s;
+        if i < until {
+            d_density[i] = 6.0 * sizes.scale * sizes.distortion * (pairs + w * length / 3.0);
+        }
+        before += scan.all;
     }
-    losses[ray] = vec2(dot(error, error), value);
+    value = sums(thread, vec2(value, 0.0)).all.x;
+    if thread == 0u {
+        losses[ray] = vec2(dot(error, error), value);
+    }
 
-    // Back to front.
+    // Back to front: what all samples behind this one add to the loss, the farthest first.
     let d = 2.0 * sizes.scale * error;
-    var behind = dot(d, background);
-    for (var i = end; i > first; i -= 1u) {
-        let k = i - 1u;
-        let alpha = opacity(k);
-        let rgb = rgb_of(k);
-        let q = dot(d, rgb) + d_density[k];
-        let d_alpha = d_color[8u * k] * (q - behind);
-        behind = alpha * q + (1.0 - alpha) * behind;
-        // d alpha / d sigma = dt (1 - alpha).
-        d_density[k] = d_alpha * steps[k].y * (1.0 - alpha) * slope(sigma[k]);
-        let d_rgb = d * weights[k] * rgb * (1.0 - rgb);
-        d_color[8u * k] = d_rgb.x;
-        d_color[8u * k + 1u] = d_rgb.y;
-        d_color[8u * k + 2u] = d_rgb.z;
+    var behind = light * dot(d, background);
+    let chunks = (until - first + 63u) / 64u;
+    for (var c = chunks; c > 0u; c -= 1u) {
+        let chunk = first + 64u * (c - 1u);
+        // Each thread keeps the samples that it wrote, and counts itself from the back.
+        let i = chunk + thread;
+        var share = 0.0;
+        if i < until {
+            share = weights[i] * (dot(d, rgb_of(i)) + d_density[i]);
+        }
+        let scan = sums(63u - thread, vec2(share, 0.0));
+        if i < until {
+            let rgb = rgb_of(i);
+            let q = dot(d, rgb) + d_density[i];
+            let alpha = opacity(i);
+            // d alpha / d sigma = dt (1 - alpha).
+            d_density[i] =
+                (d_color[8u * i] * (1.0 - alpha) * q - behind - scan.before.x) * steps[i].y * slope(sigma[i]);
+            let d_rgb = d * weights[i] * rgb * (1.0 - rgb);
+            d_color[8u * i] = d_rgb.x;
+            d_color[8u * i + 1u] = d_rgb.y;
+            d_color[8u * i + 2u] = d_rgb.z;
+        }
+        behind += scan.all.x;
     }
-    for (var i = end; i < last; i += 1u) {
+    for (var i = until + thread; i < last; i += 64u) {
         d_density[i] = 0.0;
         d_color[8u * i] = 0.0;
         d_color[8u * i + 1u] = 0.0;
         d_color[8u * i + 2u] = 0.0;
     }
     // The padding of a row stays zero.
-    for (var i = first; i < last; i += 1u) {
+    for (var i = first + thread; i < last; i += 64u) {
         for (var k = 3u; k < 8u; k += 1u) {
             d_color[8u * i + k] = 0.0;
         }

@@ -4,7 +4,7 @@
 // 0: h = act(x W + b), for tangents u = q W. 1: dx = (dz W^T) act'. 2: dW = x^T dz and db = 1^T dz, of tangents dW = q^T r,
 // added to sums over pieces of the rows.
 override product: u32;
-// Tiles of 256 x 16 in place of 64 x 64.
+// Tiles of 128 x 16 in place of 64 x 64.
 override narrow: bool;
 
 struct Sizes {
@@ -47,12 +47,13 @@ var<immediate> sizes: Sizes;
 @group(0) @binding(5) var<storage, read_write> partial_sums: array<vec4<f32>>;
 
 const DEPTH = 8u;
-// Height and width of a tile of C, by fours.
-override HEIGHT = select(16u, 64u, narrow);
+// Height and width of a tile of C, by fours, and threads across it.
+override HEIGHT = select(16u, 32u, narrow);
 override WIDTH = select(16u, 4u, narrow);
+override ACROSS = select(8u, 4u, narrow);
 
 // [DEPTH, height] of A, transposed, and [DEPTH, width] of B.
-var<workgroup> a_tile: array<vec4<f32>, 512>;
+var<workgroup> a_tile: array<vec4<f32>, 256>;
 var<workgroup> b_tile: array<vec4<f32>, 128>;
 
 // The first numbers of four, which are the `at`-th and so on; those from `end` on are zero.
@@ -60,81 +61,72 @@ fn before(v: vec4<f32>, at: u32, end: u32) -> vec4<f32> {
     return select(vec4(0.0), v, vec4(at, at + 1u, at + 2u, at + 3u) < vec4(end));
 }
 
-// A[m, k..k + 4] of products 0 and 1.
-fn left_row(m: u32, k: u32) -> vec4<f32> {
-    if m >= sizes.rows {
-        return vec4(0.0);
+// The i-th four numbers of A from column k0 on, or of B from row k0 on; zero outside. Of products 0 and 1 A lies along its
+// rows, and of product 1 B along its columns. No branch: what is outside is read from the edge and dropped, so that loads
+// need not wait for each other.
+fn left(i: u32, m_tile: u32, k0: u32, end: u32) -> vec4<f32> {
+    if product == 2u {
+        let m = m_tile + 4u * (i % HEIGHT);
+        let k = k0 + i / HEIGHT;
+        let v = x[(min(k, sizes.rows - 1u) * sizes.in_stride + min(m, sizes.in_stride - 4u)) / 4u];
+        return select(vec4(0.0), v, m < sizes.inputs && k < end);
     }
+    let m = m_tile + i % (4u * HEIGHT);
+    let k = k0 + 4u * (i / (4u * HEIGHT));
+    let row = min(m, sizes.rows - 1u);
     if product == 0u {
-        return before(x[(m * sizes.in_stride + k) / 4u], k, sizes.inputs);
+        return before(x[(row * sizes.in_stride + k) / 4u], k, select(0u, sizes.inputs, m < sizes.rows));
     }
     // Behind the outputs a skip layer has other numbers.
-    return before(z[(m * sizes.out_stride + k) / 4u], k, sizes.outputs);
+    return before(z[(row * sizes.out_stride + k) / 4u], k, select(0u, sizes.outputs, m < sizes.rows));
 }
 
-// A[m..m + 4, k] of product 2.
-fn left_column(m: u32, k: u32, end: u32) -> vec4<f32> {
-    if m >= sizes.inputs || k >= end {
-        return vec4(0.0);
+fn right(i: u32, n_tile: u32, k0: u32, end: u32) -> vec4<f32> {
+    if product == 1u {
+        let n = n_tile + i % (4u * WIDTH);
+        let k = k0 + 4u * (i / (4u * WIDTH));
+        let row = sizes.weights + min(n, sizes.inputs - 1u) * sizes.weight_stride;
+        return before(parameters[(row + k) / 4u], k, select(0u, sizes.outputs, n < sizes.inputs));
     }
-    return x[(k * sizes.in_stride + m) / 4u];
-}
-
-// B[k..k + 4, n] of product 1.
-fn right_column(k: u32, n: u32) -> vec4<f32> {
-    if n >= sizes.inputs || k >= sizes.outputs {
-        return vec4(0.0);
-    }
-    return parameters[(sizes.weights + n * sizes.weight_stride + k) / 4u];
-}
-
-// B[k, n..n + 4] of products 0 and 2.
-fn right_row(k: u32, n: u32, end: u32) -> vec4<f32> {
-    if n >= sizes.weight_stride || k >= end {
-        return vec4(0.0);
-    }
+    let n = n_tile + 4u * (i % WIDTH);
+    let k = k0 + i / WIDTH;
     if product == 0u {
-        return parameters[(sizes.weights + k * sizes.weight_stride + n) / 4u];
+        // The bias follows the rows.
+        let row = sizes.weights + min(k, sizes.inputs) * sizes.weight_stride;
+        let v = parameters[(row + min(n, sizes.weight_stride - 4u)) / 4u];
+        return select(vec4(0.0), v, n < sizes.weight_stride && k < end);
     }
     if sizes.unit == 1u {
-        return vec4(select(0.0, 1.0, n == 0u), 0.0, 0.0, 0.0);
+        return vec4(select(0.0, 1.0, n == 0u && k < end), 0.0, 0.0, 0.0);
     }
-    return before(z[(k * sizes.out_stride + n) / 4u], n, sizes.outputs);
+    let v = z[(min(k, sizes.rows - 1u) * sizes.out_stride + min(n, sizes.out_stride - 4u)) / 4u];
+    return before(v, n, select(0u, sizes.outputs, k < end));
 }
 
-// The next DEPTH numbers of the sums, into the tiles. Neighbouring threads write neighbouring numbers.
-fn load(thread: u32, m_tile: u32, n_tile: u32, k0: u32, end: u32) {
+// Puts four numbers into their tile. Neighbouring threads write neighbouring numbers.
+fn put_left(i: u32, v: vec4<f32>) {
     if product == 2u {
-        for (var i = thread; i < DEPTH * HEIGHT; i += 64u) {
-            a_tile[i] = left_column(m_tile + 4u * (i % HEIGHT), k0 + i / HEIGHT, end);
-        }
+        a_tile[i] = v;
     } else {
-        for (var i = thread; i < 4u * HEIGHT * (DEPTH / 4u); i += 64u) {
-            let m = i % (4u * HEIGHT);
-            let k = 4u * (i / (4u * HEIGHT));
-            let row = left_row(m_tile + m, k0 + k);
-            let at = k * HEIGHT + m / 4u;
-            a_tile[at][m % 4u] = row.x;
-            a_tile[at + HEIGHT][m % 4u] = row.y;
-            a_tile[at + 2u * HEIGHT][m % 4u] = row.z;
-            a_tile[at + 3u * HEIGHT][m % 4u] = row.w;
-        }
+        let m = i % (4u * HEIGHT);
+        let at = 4u * (i / (4u * HEIGHT)) * HEIGHT + m / 4u;
+        a_tile[at][m % 4u] = v.x;
+        a_tile[at + HEIGHT][m % 4u] = v.y;
+        a_tile[at + 2u * HEIGHT][m % 4u] = v.z;
+        a_tile[at + 3u * HEIGHT][m % 4u] = v.w;
     }
+}
+
+fn put_right(i: u32, v: vec4<f32>) {
     if product == 1u {
-        for (var i = thread; i < 4u * WIDTH * (DEPTH / 4u); i += 64u) {
-            let n = i % (4u * WIDTH);
-            let k = 4u * (i / (4u * WIDTH));
-            let column = right_column(k0 + k, n_tile + n);
-            let at = k * WIDTH + n / 4u;
-            b_tile[at][n % 4u] = column.x;
-            b_tile[at + WIDTH][n % 4u] = column.y;
-            b_tile[at + 2u * WIDTH][n % 4u] = column.z;
-            b_tile[at + 3u * WIDTH][n % 4u] = column.w;
-        }
+        let n = i % (4u * WIDTH);
+        let at = 4u * (i / (4u * WIDTH)) * WIDTH + n / 4u;
+        b_tile[at][n % 4u] = v.x;
+        b_tile[at + WIDTH][n % 4u] = v.y;
+        b_tile[at + 2u * WIDTH][n % 4u] = v.z;
+        b_tile[at + 3u * WIDTH][n % 4u] = v.w;
     } else {
-        for (var i = thread; i < DEPTH * WIDTH; i += 64u) {
-            b_tile[i] = right_row(k0 + i / WIDTH, n_tile + 4u * (i % WIDTH), end);
-        }
+        b_tile[i] = v;
     }
 }
 
@@ -214,9 +206,9 @@ fn multiply(
     let m_tile = (number % tiles) / across * (4u * HEIGHT);
     let n_tile = (number % tiles) % across * (4u * WIDTH);
 
-    // Each thread sums 8 x 8 numbers: four rows and columns in each half of the tile.
-    let m0 = thread / (WIDTH / 2u);
-    let n0 = thread % (WIDTH / 2u);
+    // Each thread sums 8 x 8 numbers, four rows and columns in each half of the tile, or 8 x 4 of a narrow one.
+    let m0 = thread / ACROSS;
+    let n0 = thread % ACROSS;
     var low0 = vec4(0.0);
     var low1 = vec4(0.0);
     var low2 = vec4(0.0);
@@ -235,36 +227,73 @@ fn multiply(
     var high7 = vec4(0.0);
     var bias_low = vec4(0.0);
     var bias_high = vec4(0.0);
-    for (var k0 = first; k0 < last; k0 += DEPTH) {
-        load(thread, m_tile, n_tile, k0, last);
-        workgroupBarrier();
-        for (var k = 0u; k < DEPTH; k += 1u) {
-            let top = a_tile[k * HEIGHT + m0];
-            let bottom = a_tile[k * HEIGHT + HEIGHT / 2u + m0];
-            let low = b_tile[k * WIDTH + n0];
-            let high = b_tile[k * WIDTH + WIDTH / 2u + n0];
-            low0 += top.x * low;
-            low1 += top.y * low;
-            low2 += top.z * low;
-            low3 += top.w * low;
-            low4 += bottom.x * low;
-            low5 += bottom.y * low;
-            low6 += bottom.z * low;
-            low7 += bottom.w * low;
-            high0 += top.x * high;
-            high1 += top.y * high;
-            high2 += top.z * high;
-            high3 += top.w * high;
-            high4 += bottom.x * high;
-            high5 += bottom.y * high;
-            high6 += bottom.z * high;
-            high7 += bottom.w * high;
-            if product == 2u {
-                bias_low += low;
-                bias_high += high;
+    var a0 = vec4(0.0);
+    var a1 = vec4(0.0);
+    var a2 = vec4(0.0);
+    var a3 = vec4(0.0);
+    var b0 = vec4(0.0);
+    var b1 = vec4(0.0);
+    // One more turn than there are tiles: each loads the next tile while it works on the last one.
+    for (var k0 = first; k0 < last + DEPTH; k0 += DEPTH) {
+        if k0 > first {
+            put_left(thread, a0);
+            put_left(thread + 64u, a1);
+            if narrow {
+                put_left(thread + 128u, a2);
+                put_left(thread + 192u, a3);
+                if thread < 32u {
+                    put_right(thread, b0);
+                }
+            } else {
+                put_right(thread, b0);
+                put_right(thread + 64u, b1);
+            }
+            workgroupBarrier();
+        }
+        if k0 < last {
+            a0 = left(thread, m_tile, k0, last);
+            a1 = left(thread + 64u, m_tile, k0, last);
+            b0 = right(thread, n_tile, k0, last);
+            if narrow {
+                a2 = left(thread + 128u, m_tile, k0, last);
+                a3 = left(thread + 192u, m_tile, k0, last);
+            } else {
+                b1 = right(thread + 64u, n_tile, k0, last);
             }
         }
-        workgroupBarrier();
+        if k0 > first {
+            for (var k = 0u; k < DEPTH; k += 1u) {
+                let top = a_tile[k * HEIGHT + m0];
+                let bottom = a_tile[k * HEIGHT + HEIGHT / 2u + m0];
+                let low = b_tile[k * WIDTH + n0];
+                low0 += top.x * low;
+                low1 += top.y * low;
+                low2 += top.z * low;
+                low3 += top.w * low;
+                low4 += bottom.x * low;
+                low5 += bottom.y * low;
+                low6 += bottom.z * low;
+                low7 += bottom.w * low;
+                if product == 2u {
+                    bias_low += low;
+                }
+                if !narrow {
+                    let high = b_tile[k * WIDTH + WIDTH / 2u + n0];
+                    high0 += top.x * high;
+                    high1 += top.y * high;
+                    high2 += top.z * high;
+                    high3 += top.w * high;
+                    high4 += bottom.x * high;
+                    high5 += bottom.y * high;
+                    high6 += bottom.z * high;
+                    high7 += bottom.w * high;
+                    if product == 2u {
+                        bias_high += high;
+                    }
+                }
+            }
+            workgroupBarrier();
+        }
     }
     if first >= last {
         return;
@@ -272,29 +301,31 @@ fn multiply(
     let m = m_tile + 4u * m0;
     let lower = m + 2u * HEIGHT;
     let n = n_tile + 4u * n0;
-    let right = n + 2u * WIDTH;
     store(m, n, low0);
-    store(m, right, high0);
     store(m + 1u, n, low1);
-    store(m + 1u, right, high1);
     store(m + 2u, n, low2);
-    store(m + 2u, right, high2);
     store(m + 3u, n, low3);
-    store(m + 3u, right, high3);
     store(lower, n, low4);
-    store(lower, right, high4);
     store(lower + 1u, n, low5);
-    store(lower + 1u, right, high5);
     store(lower + 2u, n, low6);
-    store(lower + 2u, right, high6);
     store(lower + 3u, n, low7);
-    store(lower + 3u, right, high7);
-    if product == 2u && sizes.tangent == 0u && m == 0u {
-        if n < sizes.weight_stride {
-            add(sizes.inputs, n, bias_low);
-        }
-        if right < sizes.weight_stride {
-            add(sizes.inputs, right, bias_high);
-        }
+    let has_bias = product == 2u && sizes.tangent == 0u && m == 0u;
+    if has_bias && n < sizes.weight_stride {
+        add(sizes.inputs, n, bias_low);
+    }
+    if narrow {
+        return;
+    }
+    let n_high = n + 2u * WIDTH;
+    store(m, n_high, high0);
+    store(m + 1u, n_high, high1);
+    store(m + 2u, n_high, high2);
+    store(m + 3u, n_high, high3);
+    store(lower, n_high, high4);
+    store(lower + 1u, n_high, high5);
+    store(lower + 2u, n_high, high6);
+    store(lower + 3u, n_high, high7);
+    if has_bias && n_high < sizes.weight_stride {
+        add(sizes.inputs, n_high, bias_high);
     }
 }

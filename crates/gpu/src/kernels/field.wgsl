@@ -58,8 +58,8 @@ fn note(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
     }
 }
 
-// Real spherical harmonics of degree 0 to 3 of a sample's direction: `spherical_harmonics`.
-fn write_harmonics(i: u32, to: u32) {
+// Real spherical harmonics of degree 0 to 3 of a sample's direction: four of sixteen, see `spherical_harmonics`.
+fn harmonics(i: u32, part: u32) -> vec4<f32> {
     let at = ray_of[i] * 20u + 3u;
     let x = rays[at];
     let y = rays[at + 1u];
@@ -67,47 +67,55 @@ fn write_harmonics(i: u32, to: u32) {
     let xx = x * x;
     let yy = y * y;
     let zz = z * z;
-    color_in[to] = 0.2820948;
-    color_in[to + 1u] = -0.4886025 * y;
-    color_in[to + 2u] = 0.4886025 * z;
-    color_in[to + 3u] = -0.4886025 * x;
-    color_in[to + 4u] = 1.0925484 * x * y;
-    color_in[to + 5u] = -1.0925484 * y * z;
-    color_in[to + 6u] = 0.9461747 * zz - 0.31539157;
-    color_in[to + 7u] = -1.0925484 * x * z;
-    color_in[to + 8u] = 0.5462742 * (xx - yy);
-    color_in[to + 9u] = 0.5900436 * y * (yy - 3.0 * xx);
-    color_in[to + 10u] = 2.8906114 * x * y * z;
-    color_in[to + 11u] = 0.4570458 * y * (1.0 - 5.0 * zz);
-    color_in[to + 12u] = 0.37317633 * z * (5.0 * zz - 3.0);
-    color_in[to + 13u] = 0.4570458 * x * (1.0 - 5.0 * zz);
-    color_in[to + 14u] = 1.4453057 * z * (xx - yy);
-    color_in[to + 15u] = 0.5900436 * x * (3.0 * yy - xx);
+    switch part {
+        case 0u: {
+            return vec4(0.2820948, -0.4886025 * y, 0.4886025 * z, -0.4886025 * x);
+        }
+        case 1u: {
+            return vec4(1.0925484 * x * y, -1.0925484 * y * z, 0.9461747 * zz - 0.31539157, -1.0925484 * x * z);
+        }
+        case 2u: {
+            let edge = 0.5900436 * y * (yy - 3.0 * xx);
+            return vec4(0.5462742 * (xx - yy), edge, 2.8906114 * x * y * z, 0.4570458 * y * (1.0 - 5.0 * zz));
+        }
+        default: {
+            let middle = 0.37317633 * z * (5.0 * zz - 3.0);
+            let side = 0.4570458 * x * (1.0 - 5.0 * zz);
+            return vec4(middle, side, 1.4453057 * z * (xx - yy), 0.5900436 * x * (3.0 * yy - xx));
+        }
+    }
 }
 
+// Eight threads for each sample, which write four numbers each: the density network's output, and the harmonics.
 @compute @workgroup_size(64)
 fn split(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let i = id.y * groups.x * 64u + id.x;
+    let thread = id.y * groups.x * 64u + id.x;
+    let i = thread / 8u;
+    let part = thread % 8u;
     if i >= sizes.samples {
         return;
     }
-    let to = 32u * i;
-    for (var k = 0u; k < 16u; k += 1u) {
-        color_in[to + k] = geometry[16u * i + k];
+    var four = vec4(0.0);
+    if part < 4u {
+        let at = 16u * i + 4u * part;
+        four = vec4(geometry[at], geometry[at + 1u], geometry[at + 2u], geometry[at + 3u]);
+    } else {
+        four = harmonics(i, part - 4u);
     }
-    write_harmonics(i, to + 16u);
+    for (var k = 0u; k < 4u; k += 1u) {
+        color_in[4u * thread + k] = four[k];
+    }
 }
 
+// One thread for each number of the density network's output.
 @compute @workgroup_size(64)
 fn join(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let i = id.y * groups.x * 64u + id.x;
-    if i >= sizes.samples {
-        return;
+    let thread = id.y * groups.x * 64u + id.x;
+    let i = thread / 16u;
+    let k = thread % 16u;
+    if i < sizes.samples {
+        geometry[thread] = color_in[32u * i + k] + select(0.0, sigma[i], k == 0u);
     }
-    for (var k = 0u; k < 16u; k += 1u) {
-        geometry[16u * i + k] = color_in[32u * i + k];
-    }
-    geometry[16u * i] += sigma[i];
 }
 
 // Position, normal, direction, features.
@@ -122,8 +130,11 @@ fn split_sdf(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgrou
         color_in[to + d] = encoded[sizes.encoded_stride * i + d];
         color_in[to + 3u + d] = normals[3u * i + d];
     }
-    if sizes.harmonics == 1u {
-        write_harmonics(i, to + 6u);
+    for (var part = 0u; part < 4u && sizes.harmonics == 1u; part += 1u) {
+        let four = harmonics(i, part);
+        for (var k = 0u; k < 4u; k += 1u) {
+            color_in[to + 6u + 4u * part + k] = four[k];
+        }
     }
     for (var k = 0u; k < sizes.features; k += 1u) {
         color_in[to + 6u + sizes.directions + k] = geometry[sizes.geometry_stride * i + 1u + k];

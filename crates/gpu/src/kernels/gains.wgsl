@@ -1,4 +1,4 @@
-// Weight normalisation: column o of a layer's weights is w_o = g_o v_o / |v_o|. Twin: `Network::add_gradient` and
+// The gradient of a network's weights, added up, and weight normalisation: column o of a layer's weights is w_o = g_o v_o / |v_o|. Twin: `Network::add_gradient` and
 // `Network::refresh` of mb-neural, whose module has the formulas.
 
 struct Sizes {
@@ -21,16 +21,29 @@ var<immediate> sizes: Sizes;
 @group(0) @binding(6) var<storage, read_write> d_lengths: array<f32>;
 @group(0) @binding(7) var<storage, read_write> weights: array<f32>;
 
-// One thread for each parameter.
+// A workgroup for eight parameters, whose eight threads each add up every eighth piece.
+var<workgroup> eighths: array<f32, 64>;
+
 @compute @workgroup_size(64)
-fn sum_up(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let i = id.y * groups.x * 64u + id.x;
-    if i < sizes.parameters {
-        var sum = 0.0;
-        for (var piece = 0u; piece < sizes.pieces; piece += 1u) {
-            let at = piece * sizes.parameters + i;
-            sum += partial_sums[at];
-            partial_sums[at] = 0.0;
+fn sum_up(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let i = (group.y * groups.x + group.x) * 8u + thread % 8u;
+    var sum = 0.0;
+    for (var piece = thread / 8u; piece < sizes.pieces && i < sizes.parameters; piece += 8u) {
+        sum += partial_sums[piece * sizes.parameters + i];
+    }
+    // Not in the same loop, where each load would wait for the store before it.
+    for (var piece = thread / 8u; piece < sizes.pieces && i < sizes.parameters; piece += 8u) {
+        partial_sums[piece * sizes.parameters + i] = 0.0;
+    }
+    eighths[thread] = sum;
+    workgroupBarrier();
+    if thread < 8u && i < sizes.parameters {
+        for (var k = 1u; k < 8u; k += 1u) {
+            sum += eighths[8u * k + thread];
         }
         d_weights[i] = sum;
     }

@@ -1,6 +1,7 @@
 // Samples of rays, wherever the occupancy grid has matter: through contracted space, or inside the unit ball or the cube
 // around it. Twins: `Nerf::march`, `Neus::march` and `Dvgo::march`.
 // `count` runs first; the host adds up the counts and gives each ray its place; `place` writes the samples.
+// A workgroup for each ray: one thread walks 64 steps, all look whether they are worth a sample.
 
 // Inside the ball or its cube steps have one length.
 override inside_ball: bool;
@@ -27,7 +28,7 @@ var<immediate> sizes: Sizes;
 // [rays, 20]: origin, direction, jitter, wanted colour, background, where contracted space begins, where the ball begins and
 // ends, the mask (negative: none), the colour that was photographed.
 @group(0) @binding(1) var<storage, read> rays: array<f32>;
-// [cells]: not zero where the cell may hold something, x fastest.
+// [cells / 32]: a bit for each cell that may hold something, x fastest.
 @group(0) @binding(2) var<storage, read> occupied: array<u32>;
 // `count` writes [rays]: samples of each ray. `place` reads [rays + 1]: where they begin.
 @group(0) @binding(3) var<storage, read_write> starts: array<u32>;
@@ -47,11 +48,44 @@ fn contract(p: vec3<f32>) -> vec3<f32> {
 fn is_occupied(u: vec3<f32>) -> bool {
     let r = sizes.resolution;
     let c = min(vec3<u32>(max(u * f32(r), vec3(0.0))), vec3(r - 1u));
-    return occupied[(c.z * r + c.y) * r + c.x] != 0u;
+    let cell = (c.z * r + c.y) * r + c.x;
+    return (occupied[cell / 32u] >> (cell % 32u) & 1u) == 1u;
+}
+
+// A point of a ray in the unit cube.
+fn unit(p: vec3<f32>) -> vec3<f32> {
+    if inside_ball {
+        return 0.5 * p + 0.5;
+    }
+    return contract(p);
+}
+
+// Distance and length of 64 steps, where the next one begins, and how many samples there are before each.
+var<workgroup> walked: array<vec2<f32>, 64>;
+var<workgroup> ahead: f32;
+var<workgroup> line: array<u32, 128>;
+
+// How many threads before this one have a sample, and how many there are.
+fn ranks(thread: u32, has_sample: bool) -> vec2<u32> {
+    line[thread] = select(0u, 1u, has_sample);
+    workgroupBarrier();
+    var half = 0u;
+    for (var reach = 1u; reach < 64u; reach *= 2u) {
+        var sum = line[half + thread];
+        if thread >= reach {
+            sum += line[half + thread - reach];
+        }
+        half = 64u - half;
+        line[half + thread] = sum;
+        workgroupBarrier();
+    }
+    let found = vec2(select(0u, line[half + max(thread, 1u) - 1u], thread > 0u), line[half + 63u]);
+    workgroupBarrier();
+    return found;
 }
 
 // Walks one ray. With `write`, fills the places up to `last` and returns the first free one.
-fn walk(ray: u32, write: bool, first: u32, last: u32) -> u32 {
+fn walk(ray: u32, thread: u32, write: bool, first: u32, last: u32) -> u32 {
     let at = ray * 20u;
     let origin = vec3(rays[at], rays[at + 1u], rays[at + 2u]);
     let direction = vec3(rays[at + 3u], rays[at + 4u], rays[at + 5u]);
@@ -61,58 +95,81 @@ fn walk(ray: u32, write: bool, first: u32, last: u32) -> u32 {
     var t = start + rays[at + 6u] * max(start * cone, sizes.step);
     var next = first;
     while t < end && next < last {
-        var dt = max(t * cone, sizes.step);
-        let p = origin + t * direction;
-        var u = 0.5 * p + 0.5;
-        if !inside_ball {
-            u = contract(p);
+        if thread == 0u {
+            for (var k = 0u; k < 64u; k += 1u) {
+                var dt = max(t * cone, sizes.step);
+                if voxels && !inside_ball {
+                    // Contraction shrinks radial steps by the square of the distance.
+                    let p = abs(origin + t * direction);
+                    let reach = max(1.0, max(p.x, max(p.y, p.z)));
+                    dt = min(sizes.step * reach * reach, 0.5 * reach);
+                }
+                walked[k] = vec2(t, dt);
+                t += dt;
+            }
+            ahead = t;
         }
+        workgroupBarrier();
+        let step = walked[thread];
+        t = ahead;
+        let u = unit(origin + step.x * direction);
         var place = u;
         if voxels {
-            if !inside_ball {
-                // Contraction shrinks radial steps by the square of the distance.
-                let reach = max(1.0, max(abs(p.x), max(abs(p.y), abs(p.z))));
-                dt = min(sizes.step * reach * reach, 0.5 * reach);
-            }
             let low = vec3(sizes.low_x, sizes.low_y, sizes.low_z);
             place = (u - low) / (vec3(sizes.high_x, sizes.high_y, sizes.high_z) - low);
         }
-        if is_occupied(u) && (!voxels || (all(place >= vec3(0.0)) && all(place <= vec3(1.0)))) {
-            if write {
-                positions[3u * next] = place.x;
-                positions[3u * next + 1u] = place.y;
-                positions[3u * next + 2u] = place.z;
-                steps[next] = vec2(t, dt);
-                ray_of[next] = ray;
-            }
-            next += 1u;
+        var has_sample = step.x < end && is_occupied(u);
+        if voxels && (any(place < vec3(0.0)) || any(place > vec3(1.0))) {
+            has_sample = false;
         }
-        t += dt;
+        let rank = ranks(thread, has_sample);
+        let to = next + rank.x;
+        if write && has_sample && to < last {
+            positions[3u * to] = place.x;
+            positions[3u * to + 1u] = place.y;
+            positions[3u * to + 2u] = place.z;
+            steps[to] = step;
+            ray_of[to] = ray;
+        }
+        next = min(next + rank.y, last);
     }
     return next;
 }
 
 @compute @workgroup_size(64)
-fn count(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let ray = id.y * groups.x * 64u + id.x;
-    if ray < sizes.rays {
-        starts[ray] = walk(ray, false, 0u, 0xffffffffu);
+fn count(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let ray = group.y * groups.x + group.x;
+    if ray >= sizes.rays {
+        return;
+    }
+    let found = walk(ray, thread, false, 0u, 0xffffffffu);
+    if thread == 0u {
+        starts[ray] = found;
     }
 }
 
 @compute @workgroup_size(64)
-fn place(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let ray = id.y * groups.x * 64u + id.x;
+fn place(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let ray = group.y * groups.x + group.x;
     if ray >= sizes.rays {
         return;
     }
     let last = starts[ray + 1u];
     // A compiler may round the two walks differently; a place that stays free gets a sample without length.
-    for (var free = walk(ray, true, starts[ray], last); free < last; free += 1u) {
-        positions[3u * free] = 0.5;
-        positions[3u * free + 1u] = 0.5;
-        positions[3u * free + 2u] = 0.5;
-        steps[free] = vec2(sizes.far, 0.0);
-        ray_of[free] = ray;
+    let free = walk(ray, thread, true, starts[ray], last);
+    for (var i = free + thread; i < last; i += 64u) {
+        positions[3u * i] = 0.5;
+        positions[3u * i + 1u] = 0.5;
+        positions[3u * i + 2u] = 0.5;
+        steps[i] = vec2(sizes.far, 0.0);
+        ray_of[i] = ray;
     }
 }
