@@ -297,7 +297,9 @@ impl Neus {
     /// Rays of each group of the next step.
     pub fn rays_of_group(&self) -> usize {
         let wanted = self.options.samples_per_step as f32 / self.samples_per_ray[0].max(1.0);
-        (wanted as usize / GROUPS).clamp(8, 128)
+        // Where rays have few samples, their number is bounded too.
+        let most = (self.options.samples_per_step / 8 / GROUPS).max(128);
+        (wanted as usize / GROUPS).clamp(8, most)
     }
 
     /// Notes how many samples inside the ball a step took on so many rays.

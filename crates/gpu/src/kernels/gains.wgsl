@@ -1,5 +1,5 @@
-// The gradient of a network's weights, added up, and weight normalisation: column o of a layer's weights is w_o = g_o v_o / |v_o|. Twin: `Network::add_gradient` and
-// `Network::refresh` of mb-neural, whose module has the formulas.
+// The gradient of a network's weights, added up; and weight normalisation: column o of a layer's weights is
+// w_o = g_o v_o / |v_o|. Twin: `Network::add_gradient` and `Network::refresh` of mb-neural, whose module has the formulas.
 
 struct Sizes {
     columns: u32,
