@@ -40,9 +40,15 @@ pub struct Buffer {
 /// Which buffers a kernel is bound to: what a step binds, the next one binds again.
 #[derive(Default)]
 struct Bindings {
-    /// By the kernel, the bindings and the buffers; with the submission that used it last.
-    groups: BTreeMap<(u64, Vec<(u32, u64)>), (wgpu::BindGroup, u64)>,
+    /// By the kernel's number, the bindings and the buffers' numbers.
+    groups: BTreeMap<(u64, Vec<(u32, u64)>), Bound>,
     submissions: u64,
+}
+
+struct Bound {
+    group: wgpu::BindGroup,
+    /// The submission that used it last.
+    used: u64,
 }
 
 /// Submissions after which buffers that nobody binds any more are let go.
@@ -345,7 +351,7 @@ impl Context {
         let mut bindings = lock(&self.bindings);
         let now = bindings.submissions;
         let key = (kernel.number, buffers.iter().map(|(binding, buffer)| (*binding, buffer.number)).collect());
-        let (group, used) = bindings.groups.entry(key).or_insert_with(|| {
+        let bound = bindings.groups.entry(key).or_insert_with(|| {
             let entries = buffers.iter().map(|(binding, buffer)| wgpu::BindGroupEntry {
                 binding: *binding,
                 resource: buffer.buffer.as_entire_binding(),
@@ -355,10 +361,10 @@ impl Context {
                 layout: &kernel.layout,
                 entries: &entries.collect::<Vec<_>>(),
             });
-            (group, now)
+            Bound { group, used: now }
         });
-        *used = now;
-        group.clone()
+        bound.used = now;
+        bound.group.clone()
     }
 }
 
@@ -414,7 +420,7 @@ impl Work<'_> {
             let mut bindings = lock(&context.bindings);
             bindings.submissions += 1;
             let oldest = bindings.submissions.saturating_sub(FORGET);
-            bindings.groups.retain(|_, (_, used)| *used >= oldest);
+            bindings.groups.retain(|_, bound| bound.used >= oldest);
         }
         let Some(profile) = &context.profile else {
             context.queue.submit([self.encoder.finish()]);

@@ -18,7 +18,7 @@ const POINTS: usize = 1 << 18;
 /// How a position is encoded.
 enum Position {
     /// Of the unit cube.
-    Hash(Encoding),
+    Hash(Box<Encoding>),
     /// Of the ball.
     Frequencies(Frequencies),
 }
@@ -53,7 +53,7 @@ impl Surface {
         let (parts, none) = (twin.parts(), || context.zeros(0));
         Self {
             position: match parts.grid {
-                Some((grid, table)) => Position::Hash(Encoding::new(context, grid, table, 3)),
+                Some((grid, table)) => Position::Hash(Box::new(Encoding::new(context, grid, table, 3))),
                 None => Position::Frequencies(parts.frequencies),
             },
             direction: parts.direction,
