@@ -111,7 +111,7 @@ impl Default for NeusOptions {
                 color_width: 64,
                 color_hidden: 1,
                 weight_norm: false,
-                initial_radius: 0.8,
+                initial_radius: 0.5,
             },
             background: RadianceFieldOptions {
                 grid: HashGridOptions { levels: 8, features: 4, log2_entries: 15, coarsest: 16, finest: 256 },
@@ -228,6 +228,8 @@ pub struct Neus {
 
 /// Light below which the rest of a ray is dropped.
 pub const DARK: f32 = 1e-3;
+/// Largest product of sharpness and shortest step. Training goes wrong from about 2.5 on.
+const SHARPNESS_OF_STEP: f32 = 2.0;
 /// Half width of the logistic density in units of 1 / s: beyond it lies less than a thousandth of the step.
 const REACH: f32 = 7.0;
 /// Shortest step behind the ball.
@@ -270,10 +272,13 @@ impl Neus {
         (10.0 * self.sharpness.values[0]).clamp(-10.0, 12.0).exp()
     }
 
-    /// One Adam step of the sharpness, number `t` from 1, given the loss's derivative by it: ds/dv = 10 s.
+    /// One Adam step of the sharpness, number `t` from 1, given the loss's derivative by it: ds/dv = 10 s. It stays where the
+    /// shortest step can follow: sections see a narrower density as a jump, and between two of them light leaks through.
     pub fn step_sharpness(&mut self, d_sharpness: f32, t: u64) {
         self.sharpness.grads[0] = d_sharpness * 10.0 * self.sharpness();
         self.sharpness.step(&ADAM, self.options.sharpness_learning_rate, t);
+        let most = SHARPNESS_OF_STEP / self.options.shortest_step;
+        self.sharpness.values[0] = self.sharpness.values[0].min(most.ln() / 10.0);
     }
 
     /// How far rays must face the surface: r of [`crate::neus_alpha`].

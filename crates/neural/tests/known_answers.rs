@@ -90,7 +90,6 @@ fn small_neus() -> NeusOptions {
     // Half as wide as the preset's, the network of colours needs a second layer: with one the box is 1.2 % too small.
     (options.field.color_width, options.field.color_hidden) = (32, 2);
     (options.table_learning_rate, options.learning_rate) = (1e-2, 5e-3);
-    options.field.initial_radius = 0.5;
     options.longest_step = 0.06;
     options.shortest_step = 0.015;
     options.first_levels = 2;
