@@ -204,7 +204,7 @@ impl GpuDvgo {
             let (mut rng, mut targets) = (rng(twin.options.seed, step * GROUPS as u64 + group), Vec::new());
             data.draw(&mut rng, twin.rays_of_group(), cameras, &mut targets);
             let packed = targets.iter().map(|target| {
-                let background: [f32; 3] = std::array::from_fn(|_| rng.random());
+                let background = twin.background(&mut rng);
                 let range = twin.range(&target.ray).map_or([0.0, -1.0], |(near, far)| [near, far]);
                 let wanted = target.before(background, twin.with_masks);
                 let mut ray = pack(target, rng.random(), background, wanted, range[0]);
