@@ -2,7 +2,8 @@
 //! `cargo bench -p mb-gpu --features wgpu --bench kernels -- [gpu|gpu:N] [SAMPLES]`. Sizes are those of `nerf`, `neus` and
 //! `dvgo` with `--preset fast`, but for the published trunk.
 //! Device: wall milliseconds, best of five, and CPU milliseconds of this process (which a software device spends, a GPU
-//! does not, but for the handing over of work). Twin: CPU milliseconds. Share: of the arithmetic (GFLOP/s) or traffic (GB/s) that the kernel needs at least.
+//! does not, but for the handing over of work). Twin: CPU milliseconds. Share: of the arithmetic (GFLOP/s) or traffic
+//! (GB/s) that the kernel needs at least.
 
 use std::time::Instant;
 
@@ -51,7 +52,7 @@ impl Rows<'_> {
         (0..5).map(|_| run(times)).fold([f64::INFINITY; 2], |best, found| [0, 1].map(|i| best[i].min(found[i])))
     }
 
-    /// The same where something has to happen `before` each run, which is not measured.
+    /// [`Self::row`] where something has to happen `before` each run, which is not measured.
     fn row_after(
         &self,
         before: impl Fn(&mut Work<'_>),
