@@ -2,7 +2,7 @@
 
 use mb_job::{Error, Progress, Result, Steps};
 use mb_mesh::TriangleMesh;
-use mb_recon::level_set_mesh;
+use mb_recon::{SupportPlane, level_set_mesh};
 use mb_render::{Scene, View as RenderView};
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
@@ -20,22 +20,46 @@ pub struct SurfaceOptions {
     pub voxel_mm: f64,
     /// Keep only what at least one camera sees.
     pub cull: bool,
+    /// Of a model that learned without masks, keep also the table or floor that the object stands on.
+    pub keep_table: bool,
 }
 
 impl Default for SurfaceOptions {
     fn default() -> Self {
-        Self { voxel_mm: 1.0, cull: true }
+        Self { voxel_mm: 1.0, cull: true, keep_table: false }
     }
+}
+
+/// A surface, and what was taken away from it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Extracted {
+    /// World frame, metres, with vertex colours.
+    pub mesh: TriangleMesh,
+    /// The table or floor that was cut off.
+    pub table: Option<Table>,
+}
+
+/// A table or floor that was cut off a surface.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Table {
+    /// Where it was found.
+    pub plane: SupportPlane,
+    /// Height above it up to which everything went, millimetres.
+    pub cut_mm: f64,
 }
 
 /// Points of a side of the blocks that are evaluated or skipped as one.
 const BLOCK: usize = 16;
 /// Largest grid: 1 GiB of numbers.
 const MAX_POINTS: usize = 1 << 28;
+/// A table is cut off up to so many times its roughness, since the surface swells in the shadow around an object's foot; at
+/// least to two voxels.
+const CLEARANCE: f64 = 4.0;
 
 /// The model's surface inside the region of interest: world frame, metres, vertex colours. Blocks without a cell that
 /// may hold the surface are not evaluated. With `cull`, triangles stay whose vertices a camera sees: in its image and
-/// no more than two voxels behind the surface's own depth map.
+/// no more than two voxels behind the surface's own depth map. Of a model that learned without masks the plane that the
+/// object stands on is cut off, where there is one.
 ///
 /// # Errors
 /// The grid would be too large; nothing was found; the person asked for a stop.
@@ -45,7 +69,7 @@ pub fn extract(
     cameras: &CameraResiduals,
     options: &SurfaceOptions,
     progress: &dyn Progress,
-) -> Result<TriangleMesh> {
+) -> Result<Extracted> {
     let region = data.region();
     let spacing = options.voxel_mm * 1e-3 / region.radius_m;
     let points = (2.0 / spacing).ceil() + 1.0;
@@ -76,8 +100,22 @@ pub fn extract(
             return Err(Error::Failed("no camera sees the surface that was found; check the poses".to_owned()));
         }
     }
+    let table = match options.keep_table || model.only_object() {
+        true => None,
+        false => cut_table(&mut mesh, data, cameras, options.voxel_mm),
+    };
     color(&mut mesh, model, data);
-    Ok(mesh)
+    Ok(Extracted { mesh, table })
+}
+
+/// Cuts off the plane that the object stands on.
+fn cut_table(mesh: &mut TriangleMesh, data: &RayDataset, cameras: &CameraResiduals, voxel_mm: f64) -> Option<Table> {
+    let centers: Vec<Point3<f64>> =
+        data.training().iter().map(|i| cameras.world_from_cam(data, *i).translation().into()).collect();
+    let plane = SupportPlane::find(mesh, &centers)?;
+    let cut_mm = (CLEARANCE * 1e3 * plane.roughness_m).max(2.0 * voxel_mm);
+    plane.cut(mesh, cut_mm * 1e-3);
+    Some(Table { plane, cut_mm })
 }
 
 /// The level-set function on the grid: negative inside, NaN outside the region.
@@ -200,4 +238,127 @@ fn color(mesh: &mut TriangleMesh, model: &dyn Model, data: &RayDataset) {
         })
         .collect();
     mesh.vertex_colors = Some(colors.concat());
+}
+
+#[cfg(test)]
+mod tests {
+    use mb_geometry::{Camera, ImageSize, Intrinsics, Rigid3, World};
+    use mb_image::Image;
+    use mb_job::Silent;
+    use nalgebra::UnitQuaternion;
+
+    use super::*;
+    use crate::cameras::CameraOptions;
+    use crate::dataset::SceneRay;
+    use crate::model::{Level, StepReport};
+
+    /// A block 60 x 80 x 50 mm on a table, distances in metres of the scene, whose unit is the region's radius.
+    struct BlockOnTable {
+        radius_m: f64,
+        only_object: bool,
+    }
+
+    impl Model for BlockOnTable {
+        fn name(&self) -> &'static str {
+            "neus"
+        }
+
+        fn only_object(&self) -> bool {
+            self.only_object
+        }
+
+        fn iterations(&self) -> u64 {
+            0
+        }
+
+        fn step(&mut self, _: &RayDataset, _: &mut CameraResiduals, _: u64) -> Result<StepReport> {
+            Err(Error::Failed("it has nothing to learn".to_owned()))
+        }
+
+        fn render(&self, _: &[SceneRay]) -> Vec<[f32; 3]> {
+            Vec::new()
+        }
+
+        fn level(&self) -> Level {
+            Level { value: 0.0, larger_inside: false }
+        }
+
+        fn surface(&self, positions: &[[f32; 3]]) -> Vec<f32> {
+            let distance = |p: &[f32; 3]| {
+                let [x, y, z] = p.map(|c| f64::from(c) * self.radius_m);
+                let block = (x.abs() - 0.03).max(y.abs() - 0.04).max(z.abs() - 0.025);
+                // The table is rough by a millimetre.
+                let table = z + 0.025 - 0.001 * (90.0 * x).sin() * (70.0 * y).cos();
+                if self.only_object { block } else { block.min(table) }
+            };
+            positions.iter().map(|p| (distance(p) / self.radius_m) as f32).collect()
+        }
+
+        fn may_cross(&self, _: [f32; 3], _: [f32; 3]) -> bool {
+            true
+        }
+
+        fn color_at(&self, positions: &[[f32; 3]], _: &[[f32; 3]]) -> Vec<[f32; 3]> {
+            vec![[0.5; 3]; positions.len()]
+        }
+
+        fn buffers(&mut self) -> Vec<&mut Vec<f32>> {
+            Vec::new()
+        }
+
+        fn restored(&mut self, _: u64) -> std::result::Result<(), String> {
+            Ok(())
+        }
+
+        fn is_finite(&self) -> bool {
+            true
+        }
+
+        fn parameter_count(&self) -> usize {
+            0
+        }
+
+        fn bytes(&self) -> usize {
+            0
+        }
+    }
+
+    /// Twelve cameras, 0.5 m away and above the table, that look at the origin.
+    fn data() -> RayDataset {
+        let view = |i: u32| {
+            let (sin, cos) = (f64::from(i) * 0.52).sin_cos();
+            let center = Vector3::new(0.4 * cos, 0.4 * sin, 0.3);
+            let turn = UnitQuaternion::face_towards(&-center, &-Vector3::z());
+            let pose = Rigid3::<World, Camera>::from_parts(turn, center);
+            let rgb = Image::from_fn(ImageSize::new(80, 60), |_, _| [128; 3]);
+            (rgb, None, Intrinsics { fx: 120.0, fy: 120.0, cx: 39.5, cy: 29.5 }, pose)
+        };
+        RayDataset::from_images((0..12).map(view).collect(), 0).expect("twelve good views")
+    }
+
+    fn extracted(only_object: bool, keep_table: bool) -> Extracted {
+        let data = data();
+        let model = BlockOnTable { radius_m: data.region().radius_m, only_object };
+        let cameras = CameraResiduals::new(&CameraOptions::default(), &data);
+        let options = SurfaceOptions { voxel_mm: 2.0, cull: true, keep_table };
+        extract(&model, &data, &cameras, &options, &Silent).expect("a surface")
+    }
+
+    #[test]
+    fn the_table_is_cut_off_where_there_are_no_masks() {
+        let Extracted { mesh, table } = extracted(false, false);
+        let table = table.expect("the object stands on something");
+        assert!(
+            table.plane.normal.z > 0.999 && (table.plane.height(&Point3::origin()) - 0.025).abs() < 5e-4,
+            "{table:?}"
+        );
+        assert!((2.0..5.0).contains(&table.cut_mm), "{table:?}");
+        let bounds = mesh.bounds();
+        assert!((bounds.max.coords - Vector3::new(0.03, 0.04, 0.025)).norm() < 1e-3, "{bounds:?}");
+        assert!(bounds.min.z > -0.025 + 1e-3 && bounds.min.x > -0.031 && bounds.min.y > -0.041, "{bounds:?}");
+        let kept = extracted(false, true);
+        assert!(kept.table.is_none() && kept.mesh.bounds().min.x < -0.08, "{:?}", kept.mesh.bounds());
+        // What was learned with masks is the object, whatever it looks like.
+        assert_eq!(extracted(true, false), extracted(true, true));
+    }
 }

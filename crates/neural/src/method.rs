@@ -13,7 +13,7 @@ use crate::cameras::{CameraOptions, CameraResiduals};
 use crate::dataset::{DataOptions, RayDataset, View};
 use crate::device::Device;
 use crate::dvgo::{Dvgo, DvgoOptions};
-use crate::extract::{SurfaceOptions, extract};
+use crate::extract::{Extracted, SurfaceOptions, Table, extract};
 use crate::model::Model;
 use crate::nerf::{Nerf, NerfOptions};
 use crate::nerf_original::{NerfOriginal, NerfOriginalOptions};
@@ -74,8 +74,9 @@ impl FieldOptions {
     /// The names that [`FieldOptions::preset`] knows.
     pub const METHODS: [&'static str; 3] = ["nerf", "dvgo", "neus"];
 
-    /// The names that it knows of their presets: small enough for a processor, and as published.
-    pub const PRESETS: [&'static str; 2] = ["fast", "paper"];
+    /// The names that it knows of their presets: small enough for a processor, as published, and, of `neus`, for the best
+    /// surface.
+    pub const PRESETS: [&'static str; 3] = ["fast", "paper", "best"];
 
     /// The options of a method in a preset; `None` for other names.
     pub fn preset(method: &str, preset: &str, seed: u64) -> Option<Self> {
@@ -85,6 +86,7 @@ impl FieldOptions {
             ("dvgo", "fast") => Method::Dvgo(DvgoOptions { seed, ..DvgoOptions::fast() }),
             ("dvgo", "paper") => Method::Dvgo(DvgoOptions { seed, ..DvgoOptions::paper() }),
             ("neus", "fast") => Method::Neus(NeusOptions { seed, ..NeusOptions::default() }),
+            ("neus", "best") => Method::Neus(NeusOptions { seed, ..NeusOptions::best() }),
             ("neus", "paper") => Method::NeusOriginal(NeusOriginalOptions { seed, ..NeusOriginalOptions::paper() }),
             _ => return None,
         };
@@ -153,6 +155,8 @@ pub struct ReconstructSummary {
     pub training: TrainSummary,
     /// Triangles of the mesh.
     pub triangles: usize,
+    /// The table that was cut off, where there are no masks.
+    pub table: Option<Table>,
     /// What was found and mended.
     pub warnings: Vec<String>,
 }
@@ -173,7 +177,7 @@ pub fn reconstruct(
     let options = FieldOptions { data: all, ..options.clone() };
     let data = RayDataset::open(sequence, &options.data, progress)?;
     let Trained { model, cameras, summary: training } = options.train(&data, device, progress)?;
-    let mesh = extract(model.as_ref(), &data, &cameras, &options.surface, progress)?;
+    let Extracted { mesh, table } = extract(model.as_ref(), &data, &cameras, &options.surface, progress)?;
     if let Some(folder) = cameras_to.filter(|_| cameras.size().is_some()) {
         write_cameras(folder, &data, &cameras)?;
     }
@@ -184,6 +188,7 @@ pub fn reconstruct(
         device: device.name(),
         training,
         triangles: mesh.triangles.len(),
+        table,
         warnings: data.warnings().to_vec(),
     };
     Ok((mesh, summary))

@@ -1,4 +1,4 @@
-//! NeuS on a hash grid (`neus --preset fast`): a signed distance field, rendered through its logistic density.
+//! NeuS on a hash grid (`neus --preset fast` and `best`): a signed distance field, rendered through its logistic density.
 //!
 //! Inside the unit ball (the region of interest) a ray is sampled where the surface may be: in cells whose distance is
 //! within the reach of the logistic density, with steps that shorten as it sharpens. Behind the ball, where there are
@@ -143,6 +143,20 @@ impl Default for NeusOptions {
 }
 
 impl NeusOptions {
+    /// The preset `best`: details half as large, steps to match, four times as many samples in a step, and twice as many
+    /// steps.
+    pub fn best() -> Self {
+        let mut options = Self { samples_per_step: 1 << 17, shortest_step: 0.004, ..Self::default() };
+        options.field.position = PositionEncoding::Hash(HashGridOptions {
+            levels: 10,
+            features: 4,
+            log2_entries: 19,
+            coarsest: 16,
+            finest: 1024,
+        });
+        options.with_iterations(12_000)
+    }
+
     /// The same with another number of steps: everything that is counted in steps follows.
     #[must_use]
     pub fn with_iterations(mut self, iterations: u64) -> Self {

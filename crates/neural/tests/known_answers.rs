@@ -21,6 +21,7 @@ use mb_neural::trainer::{RunOptions, TrainSummary, train};
 use mb_neural::{FieldOptions, Method, Views, reconstruct, synthesize};
 use nalgebra::{Matrix3, Point2, Point3, Rotation3, UnitQuaternion, Vector3};
 
+const COARSE: SurfaceOptions = SurfaceOptions { voxel_mm: 2.0, cull: true, keep_table: false };
 const CENTER: Vector3<f64> = Vector3::new(0.4, -0.2, 1.0);
 const SIZE: ImageSize = ImageSize::new(192, 192);
 const INTRINSICS: Intrinsics = Intrinsics { fx: 270.0, fy: 270.0, cx: 95.5, cy: 95.5 };
@@ -117,7 +118,7 @@ fn surface_of(photographs: Vec<Photograph>, options: NeusOptions) -> mb_mesh::Tr
     let mut neus = Neus::new(options, &data);
     run(&mut neus, &data, &json, &RunOptions::default(), &Silent).expect("it converges");
     let cameras = CameraResiduals::new(&CameraOptions::default(), &data);
-    extract(&neus, &data, &cameras, &SurfaceOptions { voxel_mm: 2.0, cull: true }, &Silent).expect("a surface")
+    extract(&neus, &data, &cameras, &COARSE, &Silent).expect("a surface").mesh
 }
 
 /// The photographs are right themselves: the cameras see the object in the middle, the right way round.
@@ -181,8 +182,7 @@ fn dvgo_finds_a_sphere_and_skips_the_space_around_it() {
     assert!(fine.samples_per_ray < 0.5 * coarse.samples_per_ray, "{} samples a ray", fine.samples_per_ray);
 
     let cameras = CameraResiduals::new(&CameraOptions::default(), &data);
-    let mesh =
-        extract(&dvgo, &data, &cameras, &SurfaceOptions { voxel_mm: 2.0, cull: true }, &Silent).expect("a surface");
+    let mesh = extract(&dvgo, &data, &cameras, &COARSE, &Silent).expect("a surface").mesh;
     // No photograph says anything of the inside, which stays hollow: its wall faces inwards.
     let outer = mesh.vertices.iter().zip(mesh.vertex_normals()).map(|(v, normal)| (v.coords - CENTER, normal));
     let radii: Vec<f64> = outer.filter(|(p, normal)| p.dot(normal) > 0.0).map(|(p, _)| p.norm()).collect();
@@ -418,7 +418,10 @@ fn a_sequence_on_disk_becomes_a_mesh_and_pictures() {
     }
     for method in FieldOptions::METHODS {
         for preset in FieldOptions::PRESETS {
-            let options = FieldOptions::preset(method, preset, 0).expect("every method has both presets");
+            let Some(options) = FieldOptions::preset(method, preset, 0) else {
+                assert!(preset == "best" && method != "neus", "{method} has no {preset}");
+                continue;
+            };
             let json = serde_json::to_string(&options).expect("plain data");
             assert_eq!(serde_json::from_str::<FieldOptions>(&json).expect("what was written"), options);
         }

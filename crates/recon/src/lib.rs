@@ -25,8 +25,10 @@ mod integrate;
 mod level_set;
 mod marching_cubes;
 mod reconstruct;
+mod support_plane;
 mod volume;
 
 pub use level_set::level_set_mesh;
 pub use reconstruct::{PoseSource, TsdfOptions, TsdfSummary, reconstruct_tsdf};
+pub use support_plane::SupportPlane;
 pub use volume::{MAX_VOLUME_BYTES, TsdfVolume};

@@ -1,5 +1,6 @@
 //! `reconstruct`: a sequence's surface, by one of the methods.
 
+use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
@@ -113,7 +114,8 @@ impl Tsdf {
 /// What all trained fields share.
 #[derive(Debug, Args)]
 pub struct FieldTraining {
-    /// `fast` is made for a processor; `paper` has the published sizes and steps, which take days there
+    /// `fast` is made for a processor; `paper` has the published sizes and steps, which take days there; `best`, of neus,
+    /// is slower than `fast` and finds more
     #[arg(long, value_name = "PRESET", default_value = "fast", value_parser = FieldOptions::PRESETS, conflicts_with = "options")]
     preset: String,
 
@@ -247,6 +249,10 @@ pub struct Field {
     #[arg(long)]
     no_cull: bool,
 
+    /// Without masks, keep also the table or floor that the object stands on
+    #[arg(long)]
+    keep_table: bool,
+
     #[command(flatten)]
     training: FieldTraining,
 }
@@ -258,6 +264,7 @@ impl Field {
             options.surface.voxel_mm = voxel_mm;
         }
         options.surface.cull &= !self.no_cull;
+        options.surface.keep_table |= self.keep_table;
         let cameras = beside(&self.out, ".cameras");
         let device = self.training.device(&options)?;
         let (mesh, summary) =
@@ -265,7 +272,7 @@ impl Field {
         mb_mesh::write_mesh(&self.out, &mesh)?;
         write_beside(&beside(&self.out, ""), &summary, &summary.training.curve)?;
         self.training.finish(&self.out);
-        let text = format!(
+        let mut text = format!(
             "wrote {}: {} triangles from {} photographs after {} steps on {} ({:.1} dB)",
             self.out.display(),
             summary.triangles,
@@ -274,6 +281,15 @@ impl Field {
             summary.device,
             summary.training.curve.last().map_or(f64::NAN, |p| p.psnr_db),
         );
+        if let Some(table) = &summary.table {
+            write!(
+                text,
+                "\ncut off what the object stands on, up to {:.1} mm above it ({:.0} % of the surface); --keep-table keeps it",
+                table.cut_mm,
+                100.0 * table.plane.share,
+            )
+            .expect("a string takes everything");
+        }
         Outcome::new(&summary, text)
     }
 }
