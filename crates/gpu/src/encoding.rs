@@ -134,6 +134,23 @@ impl Encoding {
         work.run(&k.scatter_both, &self.sizes(points, 1.0 / unit), &buffers, self.threads(points));
     }
 
+    /// Writes `[points, 3]` derivatives by the position in -1..1: what derivatives `d` of the features and, with g,
+    /// derivatives of the normals ask.
+    pub fn position_gradient(
+        &self,
+        work: &mut Work<'_>,
+        k: &Kernels,
+        points: Points<'_>,
+        d: &Buffer,
+        (gradient, d_normals): (&Buffer, &Buffer),
+        to: &Buffer,
+    ) {
+        let table = &self.table.values;
+        let buffers =
+            [(1, &self.layout), (2, points.positions), (3, table), (4, d), (6, d_normals), (7, gradient), (8, to)];
+        work.run(&k.position_gradient, &self.sizes(points, 0.0), &buffers, points.count);
+    }
+
     /// One Adam step, which clears `sums`.
     pub fn step(&self, work: &mut Work<'_>, k: &Kernels, unit: f32, step: &AdamStep) {
         let gradient = Gradient { kernel: &k.adam_table, from: (4, &self.sums), scales: None, unit };

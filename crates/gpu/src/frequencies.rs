@@ -77,6 +77,20 @@ pub fn tangent(
     derive(work, &k.tangent_of_frequencies, octaves, samples, columns, &buffers);
 }
 
+/// Writes `[samples, 3]` derivatives by the position: what derivatives of the encoding and, with g, derivatives of the normals
+/// ask.
+pub fn position_gradient(
+    work: &mut Work<'_>,
+    k: &Kernels,
+    octaves: Frequencies,
+    samples: usize,
+    columns: Columns<'_>,
+    [d, gradient, d_normals, to]: [&Buffer; 4],
+) {
+    let buffers = [(4, columns.to), (5, d), (6, d_normals), (7, gradient), (8, to)];
+    derive(work, &k.position_gradient_of_frequencies, octaves, samples, columns, &buffers);
+}
+
 fn derive(
     work: &mut Work<'_>,
     kernel: &Kernel,

@@ -15,6 +15,7 @@ use crate::encoding::{Points, unit_of};
 use crate::frequency_field::FrequencyNetworks;
 use crate::kernels::Kernels;
 use crate::on_device::Learner;
+use crate::ray_gradients::RAY_GRADIENT;
 use crate::rays::{RAY, Samples, pack, starts};
 use crate::surface::Surface;
 use crate::trained::AdamStep;
@@ -224,7 +225,7 @@ impl GpuNeusOriginal {
         let n = self.inner.len;
         self.surface.reserve(context, n);
         self.outside.reserve(context, self.outer.len);
-        context.reserve(&mut self.losses, 4 * count);
+        context.reserve(&mut self.losses, (4 + RAY_GRADIENT) * count);
         let (k, twin, f, out) = (&self.kernels, &self.twin, &self.surface, &self.outside);
         let o = &twin.options;
         let mut work = context.work();

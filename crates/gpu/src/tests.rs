@@ -1,6 +1,7 @@
 //! Every kernel beside its twin on the processor, on whatever device this machine has (in continuous integration a
 //! software one).
 
+mod cameras;
 mod training;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

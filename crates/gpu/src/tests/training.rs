@@ -103,7 +103,7 @@ impl mb_job::Progress for LoseAt {
     }
 }
 
-fn small_neus() -> NeusOptions {
+pub fn small_neus() -> NeusOptions {
     let grid = HashGridOptions { levels: 4, features: 2, log2_entries: 12, coarsest: 8, finest: 64 };
     let mut options = NeusOptions {
         samples_per_step: 1 << 12,
