@@ -267,14 +267,11 @@ impl Learner for GpuNeus {
         if !moves {
             self.next.keep(step + 1, self.draw(data, cameras, step + 1));
         }
-        let asked = if moves { count } else { 0 };
-        let found: Vec<f32> = self.context.read(&self.losses, 4 * count + RAY_GRADIENT * asked)?;
+        let found: Vec<f32> = self.context.read(&self.losses, 4 * count + RAY_GRADIENT * targets.len())?;
         let (losses, asked) = found.split_at(4 * count);
         let losses = losses.as_chunks::<4>().0;
-        if moves {
-            let factor = self.twin.options.schedule.factor(step + 1);
-            correct(cameras, data, &targets, asked.as_chunks().0, (factor, step));
-        }
+        let factor = self.twin.options.schedule.factor(step + 1);
+        correct(cameras, data, &targets, asked.as_chunks().0, (factor, step));
         let sum = |i: usize| losses.iter().map(|l| f64::from(l[i])).sum::<f64>();
         let (mse, loss) = (sum(0) / (3 * count) as f64, sum(1) / count as f64);
         self.twin.step_sharpness(sum(2) as f32, step + 1);

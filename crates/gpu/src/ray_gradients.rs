@@ -79,8 +79,8 @@ pub fn add(
     work.run(&k.ray_gradient, &sizes, &buffers, count * WORKGROUP);
 }
 
-/// Moves the cameras of rays, in the order in which they were drawn, as `[rays, 8]` derivatives ask; `factor` is the
-/// schedule's.
+/// Moves the cameras of a step's rays, which come in the order in which they were drawn, as their derivatives ask; without rays
+/// they stay. `factor` is the schedule's.
 pub fn correct(
     cameras: &mut CameraResiduals,
     data: &RayDataset,

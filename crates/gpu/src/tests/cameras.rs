@@ -10,6 +10,7 @@ use mb_neural::sdf_field::DirectionEncoding;
 
 use super::training::small_neus;
 use super::*;
+use crate::nerf::GpuNerf;
 use crate::neus::GpuNeus;
 use crate::on_device::OnDevice;
 use crate::ray_gradients::{self, ByColor, ByPosition, Coordinates};
@@ -181,19 +182,13 @@ fn run(model: &mut dyn Model, data: &RayDataset) -> (Vec<f64>, Vec<Vec<f32>>) {
     (losses, buffers)
 }
 
-/// Training with cameras that move follows the twin and repeats its bytes; both are made anew for each run.
-fn check_training(
-    what: &str,
-    data: &RayDataset,
-    twin: &mut dyn Model,
-    gpu: impl Fn() -> Box<dyn Model>,
-    tolerance: f64,
-) {
+/// Training with cameras that move follows the twin and repeats its bytes.
+fn check_training(data: &RayDataset, twin: &mut dyn Model, gpu: impl Fn() -> Box<dyn Model>, tolerance: f64) {
     let ((expected, _), found) = (run(twin, data), run(gpu().as_mut(), data));
     for (step, (found, expected)) in found.0.iter().zip(&expected).enumerate() {
-        assert!((found - expected).abs() < tolerance * expected, "{what}, step {step}: {found} is not {expected}");
+        assert!((found - expected).abs() < tolerance * expected, "step {step}: {found} is not {expected}");
     }
-    assert!(run(gpu().as_mut(), data) == found, "{what}: two runs differ");
+    assert!(run(gpu().as_mut(), data) == found, "two runs differ");
 }
 
 #[test]
@@ -212,9 +207,31 @@ fn neus_moves_cameras_as_its_twin_does() {
             twin
         };
         let gpu = |twin| Box::new(OnDevice(GpuNeus::new(twin, Arc::clone(&context))));
-        let what = format!("neus, masks {with_masks}");
-        check_step(&what, &data, [&mut start(), gpu(start()).as_mut()], 0, 1e-3);
-        let new = || Neus::new(small_neus(), &data);
-        check_training(&what, &data, &mut new(), || gpu(new()), 0.05);
+        check_step(&format!("masks {with_masks}"), &data, [&mut start(), gpu(start()).as_mut()], 0, 1e-3);
     }
+    let data = scene(false);
+    let start = || Neus::new(small_neus(), &data);
+    let gpu = || Box::new(OnDevice(GpuNeus::new(start(), Arc::clone(&context)))) as Box<dyn Model>;
+    check_training(&data, &mut start(), gpu, 0.01);
+}
+
+#[test]
+fn nerf_moves_cameras_as_its_twin_does() {
+    let Some((context, _guard)) = device() else { return };
+    for with_masks in [true, false] {
+        let data = scene(with_masks);
+        let start = || {
+            let mut twin = Nerf::new(NerfOptions { object_only: with_masks, ..small() }, &data);
+            // A table that already says something.
+            let mut rng = rng(7, 0);
+            twin.parameters.table.values.iter_mut().for_each(|v| *v = rng.random_range(-0.5..0.5));
+            twin
+        };
+        let gpu = |twin| Box::new(OnDevice(GpuNerf::new(twin, Arc::clone(&context))));
+        check_step(&format!("masks {with_masks}"), &data, [&mut start(), gpu(start()).as_mut()], 0, 1e-3);
+    }
+    let data = scene(false);
+    let start = || Nerf::new(small(), &data);
+    let gpu = || Box::new(OnDevice(GpuNerf::new(start(), Arc::clone(&context)))) as Box<dyn Model>;
+    check_training(&data, &mut start(), gpu, 1e-3);
 }
