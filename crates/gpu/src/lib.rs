@@ -13,7 +13,7 @@
 //! Every kernel has a twin on the processor, to which the tests compare it. Sums that meet in one place are added as
 //! whole numbers or in a fixed order, so a run's result does not depend on the order of threads.
 //!
-//! Limits: cameras move only in `nerf` and `neus` of the preset `fast`; a hash encoding in `neus` of the preset `fast` and frequencies in that of `paper`; rendering and extraction run on the processor.
+//! Limits: cameras move only in `dvgo` and in `nerf` and `neus` of the preset `fast`; a hash encoding in `neus` of the preset `fast` and frequencies in that of `paper`; rendering and extraction run on the processor.
 
 use std::str::FromStr;
 
@@ -105,8 +105,8 @@ fn unsupported(options: &FieldOptions) -> Option<&'static str> {
     let hashed = |position| matches!(position, PositionEncoding::Hash(_));
     let moves = options.cameras.refine_poses || options.cameras.refine_focal;
     match &options.method {
-        Method::NerfOriginal(_) | Method::Dvgo(_) | Method::NeusOriginal(_) if moves => {
-            Some("a GPU corrects cameras in training only with nerf and neus of the preset fast yet")
+        Method::NerfOriginal(_) | Method::NeusOriginal(_) if moves => {
+            Some("a GPU corrects cameras in training only with dvgo and with nerf and neus of the preset fast yet")
         }
         Method::Neus(neus) if !hashed(neus.field.position) => {
             Some("a GPU trains neus with frequencies only as published, with the preset paper")

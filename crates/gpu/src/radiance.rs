@@ -127,7 +127,7 @@ impl Radiance {
         self.encoding.normals(work, k, s.points(s.len), self.density.d_input(), &self.d_positions);
         // In -1..1 contracted space is half as long.
         let position = ByPosition { d: &self.d_positions, of: Coordinates::Contracted, scale: [0.5; 3] };
-        let direction = DirectionEncoding::Harmonics;
+        let direction = Some(DirectionEncoding::Harmonics);
         let color = ByColor { d: self.color.d_input(), stride: 32, with_position: false, first: 16, direction };
         ray_gradients::add(work, k, rays, s, (position, color), to);
     }

@@ -43,15 +43,16 @@ pub struct ByColor<'a> {
     pub with_position: bool,
     /// First column of the encoded direction.
     pub first: usize,
-    /// How the direction is encoded.
-    pub direction: DirectionEncoding,
+    /// How the direction is encoded, where the network sees it.
+    pub direction: Option<DirectionEncoding>,
 }
 
 impl ByColor<'_> {
     fn sizes(&self) -> [u32; 5] {
         let (columns, harmonics) = match self.direction {
-            DirectionEncoding::Harmonics => (HARMONICS, 1),
-            DirectionEncoding::Frequencies(octaves) => (Frequencies(octaves).width(), 0),
+            None => (0, 0),
+            Some(DirectionEncoding::Harmonics) => (HARMONICS, 1),
+            Some(DirectionEncoding::Frequencies(octaves)) => (Frequencies(octaves).width(), 0),
         };
         [self.stride, usize::from(self.with_position), self.first, columns, harmonics].map(|n| n as u32)
     }

@@ -224,7 +224,7 @@ impl Surface {
             stride: self.color_stride,
             with_position: true,
             first: 6,
-            direction: self.direction,
+            direction: Some(self.direction),
         };
         ray_gradients::add(work, k, rays, s, (position, color), to);
     }

@@ -17,6 +17,8 @@ struct Sizes {
     active_levels: u32,
     // `scatter`: units of the sums in 1.
     units: f32,
+    // `normals_of`: 1 where it adds to what is there.
+    adds: u32,
 }
 
 struct Level {
@@ -161,7 +163,8 @@ fn normals_of(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgro
         }
     }
     for (var d = 0u; d < 3u; d += 1u) {
-        normals[3u * sample + d] = own_column(sample, d) + n[d];
+        let before = select(0.0, normals[3u * sample + d], sizes.adds == 1u);
+        normals[3u * sample + d] = before + own_column(sample, d) + n[d];
     }
 }
 

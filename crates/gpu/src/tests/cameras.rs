@@ -10,6 +10,7 @@ use mb_neural::sdf_field::DirectionEncoding;
 
 use super::training::small_neus;
 use super::*;
+use crate::dvgo::GpuDvgo;
 use crate::nerf::GpuNerf;
 use crate::neus::GpuNeus;
 use crate::on_device::OnDevice;
@@ -138,7 +139,7 @@ fn derivatives_by_rays_agree_with_their_twins() {
         to.extend([[1.0, 1.0, 1.0, 0.0], [2.0, 2.0, 2.0, 0.0]].repeat(counts.len()));
         let to = context.upload(&to);
         let position = ByPosition { d: &d_position, of, scale };
-        let color = ByColor { d: &d_color, stride, with_position, first, direction };
+        let color = ByColor { d: &d_color, stride, with_position, first, direction: Some(direction) };
         let mut work = context.work();
         ray_gradients::add(&mut work, &k, (&rays, counts.len()), &s, (position, color), (&to, 5));
         work.submit();
@@ -233,5 +234,30 @@ fn nerf_moves_cameras_as_its_twin_does() {
     let data = scene(false);
     let start = || Nerf::new(small(), &data);
     let gpu = || Box::new(OnDevice(GpuNerf::new(start(), Arc::clone(&context)))) as Box<dyn Model>;
+    check_training(&data, &mut start(), gpu, 1e-3);
+}
+
+#[test]
+fn dvgo_moves_cameras_as_its_twin_does() {
+    let Some((context, _guard)) = device() else { return };
+    for (with_masks, step) in [(true, 0), (true, 8), (false, 0), (false, 8)] {
+        let data = scene(with_masks);
+        let start = || {
+            // After a coarse stage that has learned nothing all of the space is open; the box need not be a cube.
+            let mut twin = Dvgo::new(DvgoOptions { free_space: 1e-5, ..small_dvgo() }, &data);
+            twin.begin(step).expect("all of the space");
+            (twin.bounds.low, twin.bounds.high) = ([0.1, 0.05, 0.2], [0.9, 0.95, 0.85]);
+            // Voxels that already say something.
+            let mut rng = rng(7, 0);
+            twin.parameters.density.values.iter_mut().for_each(|v| *v = rng.random_range(-4.0..8.0));
+            twin.parameters.features.values.iter_mut().for_each(|v| *v = rng.random_range(-1.0..1.0));
+            twin
+        };
+        let mut gpu = OnDevice(GpuDvgo::new(start(), Arc::clone(&context)));
+        check_step(&format!("masks {with_masks}, step {step}"), &data, [&mut start(), &mut gpu], step, 1e-3);
+    }
+    let data = scene(false);
+    let start = || Dvgo::new(small_dvgo(), &data);
+    let gpu = || Box::new(OnDevice(GpuDvgo::new(start(), Arc::clone(&context)))) as Box<dyn Model>;
     check_training(&data, &mut start(), gpu, 1e-3);
 }
