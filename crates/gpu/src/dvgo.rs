@@ -163,7 +163,7 @@ impl Voxels {
             Some(color) => {
                 first = self.features.features();
                 let columns = Columns { to: &color.input, stride, first };
-                frequencies::normals(work, k, color.position, s.len, columns, [d_features, d]);
+                frequencies::normals(work, k, color.position, (s.len, 3), columns, [d_features, d]);
                 self.features.add_normals(work, k, points, d_features, d);
                 first += color.position.width();
                 direction = Some(DirectionEncoding::Frequencies(color.direction.0));
@@ -171,10 +171,7 @@ impl Voxels {
         }
         self.density.add_normals(work, k, points, &self.d_raw, d);
         // In -1..1 contracted space is half as long as in its own cube.
-        let length = match of {
-            Coordinates::Scene => 1.0,
-            Coordinates::Contracted => 0.5,
-        };
+        let length = if matches!(of, Coordinates::Contracted) { 0.5 } else { 1.0 };
         let scale = std::array::from_fn(|i| length / (bounds.high[i] - bounds.low[i]));
         let color = ByColor { d: d_features, stride, with_position: false, first, direction };
         ray_gradients::add(work, k, rays, s, (ByPosition { d, of, scale }, color), (to, 0));

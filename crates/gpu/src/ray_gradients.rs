@@ -12,23 +12,25 @@ use crate::rays::Samples;
 /// Numbers of a ray's derivatives: of its origin and of its direction, each with one of padding.
 pub const RAY_GRADIENT: usize = 8;
 
-/// Of what the positions of samples are coordinates. Both have their origin in the middle of the region of interest.
+/// Of what the positions of samples are coordinates. Their origin is the middle of the region of interest.
 #[derive(Debug, Clone, Copy)]
 pub enum Coordinates {
     /// The scene.
     Scene,
     /// Contracted space, whose cube is -2..2.
     Contracted,
+    /// What is outside the ball, as four numbers: `(p / |p|, 1 / |p|)`.
+    Inverted,
 }
 
 /// Derivatives of a loss by the positions of samples.
 #[derive(Clone, Copy)]
 pub struct ByPosition<'a> {
-    /// `[samples, 3]`
+    /// `[samples, 3]`, or 4.
     pub d: &'a Buffer,
     /// Of what the positions are coordinates.
     pub of: Coordinates,
-    /// How fast the positions grow with those.
+    /// How fast the positions grow with those; their fourth number is as it is.
     pub scale: [f32; 3],
 }
 
@@ -71,6 +73,7 @@ pub fn add(
     let space = match position.of {
         Coordinates::Scene => 0,
         Coordinates::Contracted => 1,
+        Coordinates::Inverted => 2,
     };
     let mut sizes = vec![count as u32, space];
     sizes.extend(position.scale.map(f32::to_bits));

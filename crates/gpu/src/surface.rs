@@ -158,7 +158,7 @@ impl Surface {
         match &self.position {
             Position::Hash(encoding) => encoding.normals(work, k, points, gradient, &self.normals),
             Position::Frequencies(octaves) => {
-                frequencies::normals(work, k, *octaves, rows, self.columns(), [gradient, &self.normals]);
+                frequencies::normals(work, k, *octaves, (rows, 3), self.columns(), [gradient, &self.normals]);
             }
         }
         let split = [

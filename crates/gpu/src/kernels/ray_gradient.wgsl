@@ -3,7 +3,8 @@
 
 struct Sizes {
     rays: u32,
-    // Of what the positions are coordinates: 0 the scene, 1 contracted space, whose cube is -2..2. How fast they grow with those.
+    // Of what the positions are coordinates: 0 the scene, 1 contracted space, whose cube is -2..2, 2 what is outside the ball, as
+    // (p / |p|, 1 / |p|). How fast they grow with those.
     space: u32,
     scale_x: f32,
     scale_y: f32,
@@ -26,7 +27,7 @@ var<immediate> sizes: Sizes;
 @group(0) @binding(2) var<storage, read> starts: array<u32>;
 // [samples]: distance and length.
 @group(0) @binding(3) var<storage, read> steps: array<vec2<f32>>;
-// [samples, 3]: derivatives by the position.
+// [samples, 3], or 4 outside the ball: derivatives by the position.
 @group(0) @binding(4) var<storage, read> d_positions: array<f32>;
 // [samples, stride]: derivatives by what the colour network takes.
 @group(0) @binding(5) var<storage, read> d_color: array<f32>;
@@ -49,12 +50,26 @@ fn contract_gradient(p: vec3<f32>, g: vec3<f32>) -> vec3<f32> {
     return (2.0 - 1.0 / norm) / norm * g + slope * dot(g, p) * sign(p) * widest;
 }
 
+// J^T g of p -> (p / m, 1 / m), m = max(|p|, 1).
+fn invert_gradient(p: vec3<f32>, g: vec4<f32>) -> vec3<f32> {
+    let m = length(p);
+    if m <= 1.0 {
+        return g.xyz;
+    }
+    let along = dot(p, g.xyz) / (m * m);
+    return (g.xyz - along * p) / m - g.w / (m * m * m) * p;
+}
+
 // The derivative by the scene's point.
 fn scene_gradient(i: u32, p: vec3<f32>) -> vec3<f32> {
-    var g = vec3(d_positions[3u * i], d_positions[3u * i + 1u], d_positions[3u * i + 2u]);
+    let at = select(3u, 4u, sizes.space == 2u) * i;
+    var g = vec3(d_positions[at], d_positions[at + 1u], d_positions[at + 2u]);
     g *= vec3(sizes.scale_x, sizes.scale_y, sizes.scale_z);
     if sizes.space == 1u {
         g = contract_gradient(p, g);
+    }
+    if sizes.space == 2u {
+        g = invert_gradient(p, vec4(g, d_positions[at + 3u]));
     }
     if sizes.with_position == 1u {
         let row = sizes.stride * i;

@@ -5,14 +5,17 @@ use mb_neural::contraction::contract_gradient;
 use mb_neural::dataset::SceneRay;
 use mb_neural::encoding::{HARMONICS, harmonics_gradient};
 use mb_neural::model::Model;
+use mb_neural::nerf_original::NerfOriginal;
 use mb_neural::neus::Neus;
+use mb_neural::neus_original::NeusOriginal;
 use mb_neural::sdf_field::DirectionEncoding;
 
-use super::training::small_neus;
+use super::training::{gpu_nerf_original, small_nerf_original, small_neus, small_neus_original};
 use super::*;
 use crate::dvgo::GpuDvgo;
 use crate::nerf::GpuNerf;
 use crate::neus::GpuNeus;
+use crate::neus_original::GpuNeusOriginal;
 use crate::on_device::OnDevice;
 use crate::ray_gradients::{self, ByColor, ByPosition, Coordinates};
 
@@ -260,4 +263,31 @@ fn dvgo_moves_cameras_as_its_twin_does() {
     let start = || Dvgo::new(small_dvgo(), &data);
     let gpu = || Box::new(OnDevice(GpuDvgo::new(start(), Arc::clone(&context)))) as Box<dyn Model>;
     check_training(&data, &mut start(), gpu, 1e-3);
+}
+
+#[test]
+fn the_original_nerf_moves_cameras_as_its_twin_does() {
+    let Some((context, _guard)) = device() else { return };
+    let twin = |data: &RayDataset| NerfOriginal::new(small_nerf_original(), data);
+    for with_masks in [true, false] {
+        let data = scene(with_masks);
+        let mut gpu = gpu_nerf_original(&data, &context);
+        check_step(&format!("masks {with_masks}"), &data, [&mut twin(&data), &mut gpu], 0, 1e-3);
+    }
+    let data = scene(false);
+    check_training(&data, &mut twin(&data), || Box::new(gpu_nerf_original(&data, &context)), 1e-3);
+}
+
+#[test]
+fn the_original_neus_moves_cameras_as_its_twin_does() {
+    let Some((context, _guard)) = device() else { return };
+    let twin = |data: &RayDataset| NeusOriginal::new(small_neus_original(), data);
+    let gpu = |data: &RayDataset| Box::new(OnDevice(GpuNeusOriginal::new(twin(data), Arc::clone(&context))));
+    for with_masks in [true, false] {
+        let data = scene(with_masks);
+        // The warm-up begins with a rate of zero; half of the annealing is over.
+        check_step(&format!("masks {with_masks}"), &data, [&mut twin(&data), gpu(&data).as_mut()], 1, 1e-3);
+    }
+    let data = scene(false);
+    check_training(&data, &mut twin(&data), || gpu(&data), 2e-3);
 }
