@@ -202,10 +202,18 @@ fn neus_moves_cameras_as_its_twin_does() {
         let data = scene(with_masks);
         let start = || {
             let mut twin = Neus::new(small_neus(), &data);
-            // Tables that already say something, and a sharper surface.
+            // Tables that already say something, a network that hears of them, and a sharper surface.
             let mut rng = rng(7, 0);
-            let (table, _) = twin.field.parts_mut();
+            let (table, [geometry, _]) = twin.field.parts_mut();
             table.values.iter_mut().for_each(|v| *v = rng.random_range(-0.05..0.05));
+            let first = geometry.mlp().layout().next();
+            let [weights, _] = geometry.parts_mut();
+            if let Some((inputs, outputs, stride, at, _)) = first {
+                for row in weights.values[at..].chunks_mut(stride).take(inputs) {
+                    row[..outputs].iter_mut().for_each(|v| *v += rng.random_range(-0.3..0.3));
+                }
+            }
+            twin.field.refresh();
             twin.outside_parameters.table.values.iter_mut().for_each(|v| *v = rng.random_range(-0.5..0.5));
             twin.sharpness.values[0] = 0.4;
             twin
