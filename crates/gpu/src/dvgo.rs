@@ -5,20 +5,22 @@ use std::sync::Arc;
 
 use mb_job::{Result, rng};
 use mb_neural::cameras::CameraResiduals;
-use mb_neural::dataset::RayDataset;
-use mb_neural::dvgo::{Dvgo, FAR};
+use mb_neural::dataset::{RayDataset, TargetRay};
+use mb_neural::dvgo::{Dvgo, FAR, UnitBox};
 use mb_neural::encoding::Frequencies;
 use mb_neural::model::{GROUPS, StepReport};
+use mb_neural::sdf_field::DirectionEncoding;
 use mb_neural::voxel_field::{ADAM, VoxelField, VoxelParameters, VoxelRates};
 use rand::RngExt as _;
 use rayon::prelude::*;
 
 use crate::context::{Buffer, Context, Work};
 use crate::encoding::Encoding;
-use crate::frequencies::{Columns, encode_directions, encode_positions};
+use crate::frequencies::{self, Columns, encode_directions, encode_positions};
 use crate::kernels::Kernels;
 use crate::network::Network;
 use crate::on_device::Learner;
+use crate::ray_gradients::{self, ByColor, ByPosition, Coordinates, RAY_GRADIENT, correct};
 use crate::rays::{Ahead, RAY, Rays, Samples, Space, occupied, pack};
 use crate::trained::AdamStep;
 
@@ -52,6 +54,7 @@ pub struct Voxels {
     pub d_raw: Buffer,
     /// See `d_raw`.
     pub d_color: Buffer,
+    d_positions: Buffer,
 }
 
 impl Voxels {
@@ -76,6 +79,7 @@ impl Voxels {
             plain: none(),
             d_raw: none(),
             d_color: none(),
+            d_positions: none(),
         }
     }
 
@@ -91,6 +95,11 @@ impl Voxels {
                 color.network.reserve(context, n);
             }
         }
+    }
+
+    /// Makes room for what [`Self::ray_gradients`] leaves of so many samples.
+    fn reserve_gradients(&mut self, context: &Context, n: usize) {
+        context.reserve(&mut self.d_positions, 3 * n);
     }
 
     /// Colours before the sigmoid, `[samples, 8]`.
@@ -123,15 +132,49 @@ impl Voxels {
     /// Sends `d_raw` and `d_color` back to the network and, in this unit, to the voxels.
     pub fn backward(&self, work: &mut Work<'_>, k: &Kernels, s: &Samples, unit: f32) {
         let points = s.points(s.len);
-        let d_features = match &self.color {
-            None => &self.d_color,
-            Some(color) => {
-                color.network.backward(work, k, &color.input, &self.d_color, s.len);
-                color.network.d_input()
-            }
-        };
-        self.features.scatter(work, k, points, d_features, unit);
+        if let Some(color) = &self.color {
+            color.network.backward(work, k, &color.input, &self.d_color, s.len);
+        }
+        self.features.scatter(work, k, points, self.d_features(), unit);
         self.density.scatter(work, k, points, &self.d_raw, unit);
+    }
+
+    /// After [`Self::backward`]: derivatives of the features, which are the first columns of what the network takes or the
+    /// colours themselves.
+    fn d_features(&self) -> &Buffer {
+        self.color.as_ref().map_or(&self.d_color, |color| color.network.d_input())
+    }
+
+    /// After [`Self::backward`]: adds to `[rays, 8]` numbers what the losses ask of the rays, whose samples lie in this box.
+    fn ray_gradients(
+        &self,
+        work: &mut Work<'_>,
+        k: &Kernels,
+        rays: (&Buffer, usize),
+        s: &Samples,
+        (of, bounds): (Coordinates, UnitBox),
+        to: &Buffer,
+    ) {
+        let (points, d, d_features) = (s.points(s.len), &self.d_positions, self.d_features());
+        let stride = self.features.stride();
+        let (mut first, mut direction) = (0, None);
+        match &self.color {
+            None => self.features.normals(work, k, points, d_features, d),
+            Some(color) => {
+                first = self.features.features();
+                let columns = Columns { to: &color.input, stride, first };
+                frequencies::normals(work, k, color.position, (s.len, 3), columns, [d_features, d]);
+                self.features.add_normals(work, k, points, d_features, d);
+                first += color.position.width();
+                direction = Some(DirectionEncoding::Frequencies(color.direction.0));
+            }
+        }
+        self.density.add_normals(work, k, points, &self.d_raw, d);
+        // In -1..1 contracted space is half as long as in its own cube.
+        let length = if matches!(of, Coordinates::Contracted) { 0.5 } else { 1.0 };
+        let scale = std::array::from_fn(|i| length / (bounds.high[i] - bounds.low[i]));
+        let color = ByColor { d: d_features, stride, with_position: false, first, direction };
+        ray_gradients::add(work, k, rays, s, (ByPosition { d, of, scale }, color), (to, 0));
     }
 
     /// One Adam step, number `t` from 1.
@@ -171,7 +214,15 @@ pub struct GpuDvgo {
     bright: Samples,
     rays: Buffer,
     losses: Buffer,
-    next: Ahead<Vec<[f32; RAY]>>,
+    /// What the losses ask of the rays, where a step moves the cameras.
+    asked: Buffer,
+    next: Ahead<Drawn>,
+}
+
+/// Rays of a step, where it moves the cameras also as they were drawn.
+struct Drawn {
+    rays: Vec<[f32; RAY]>,
+    targets: Vec<TargetRay>,
 }
 
 fn voxels(context: &Context, twin: &Dvgo) -> Voxels {
@@ -191,6 +242,7 @@ impl GpuDvgo {
             bright: Samples::new(c),
             rays: c.zeros(0),
             losses: c.zeros(0),
+            asked: c.zeros(0),
             next: Ahead::none(),
             twin,
             context,
@@ -198,8 +250,8 @@ impl GpuDvgo {
     }
 
     /// The rays of a step, as the twin draws them.
-    fn draw(&self, data: &RayDataset, cameras: &CameraResiduals, step: u64) -> Vec<[f32; RAY]> {
-        let twin = &self.twin;
+    fn draw(&self, data: &RayDataset, cameras: &CameraResiduals, step: u64) -> Drawn {
+        let (twin, moves) = (&self.twin, cameras.wants_gradients(step));
         let groups = (0..GROUPS as u64).into_par_iter().map(|group| {
             let (mut rng, mut targets) = (rng(twin.options.seed, step * GROUPS as u64 + group), Vec::new());
             data.draw(&mut rng, twin.rays_of_group(), cameras, &mut targets);
@@ -211,9 +263,11 @@ impl GpuDvgo {
                 ray[14..16].copy_from_slice(&range);
                 ray
             });
-            packed.collect::<Vec<_>>()
+            let packed = packed.collect::<Vec<_>>();
+            (packed, if moves { targets } else { Vec::new() })
         });
-        groups.collect::<Vec<_>>().concat()
+        let (rays, targets): (Vec<_>, Vec<_>) = groups.unzip();
+        Drawn { rays: rays.concat(), targets: targets.concat() }
     }
 
     /// Samples of the rays, and those of them that are worth a colour.
@@ -247,11 +301,16 @@ impl GpuDvgo {
         std::iter::once(count as u32).chain(floats.map(f32::to_bits)).collect()
     }
 
-    /// Forward, loss, backward and Adam; the losses stay in `self.losses`.
-    fn learn(&mut self, count: usize, step: u64) {
+    /// Forward, loss, backward and Adam; the losses stay in `self.losses`, and, where the step moves the cameras, what they ask
+    /// of the rays in `self.asked`.
+    fn learn(&mut self, count: usize, step: u64, moves: bool) {
         let (context, rays) = (&*self.context, &self.rays);
         self.field.reserve(context, self.bright.len);
         context.reserve(&mut self.losses, 2 * count);
+        if moves {
+            self.field.reserve_gradients(context, self.bright.len);
+            context.reserve(&mut self.asked, RAY_GRADIENT * count);
+        }
         let (k, f, s) = (&self.kernels, &self.field, &self.bright);
         let mut work = context.work();
         f.forward(&mut work, k, rays, s);
@@ -267,6 +326,11 @@ impl GpuDvgo {
         work.run(&k.voxel_losses, &self.sizes(count), &losses, count);
         let unit = unit_of(1.0 / count as f32);
         f.backward(&mut work, k, s, unit);
+        if moves {
+            let of = if self.twin.with_masks { Coordinates::Scene } else { Coordinates::Contracted };
+            work.clear(&self.asked);
+            f.ray_gradients(&mut work, k, (rays, count), s, (of, self.twin.bounds), &self.asked);
+        }
         let (t, factor) = self.twin.course(step);
         f.step(&mut work, k, unit, self.twin.rates(factor), t);
         work.submit();
@@ -290,16 +354,20 @@ impl Learner for GpuDvgo {
             self.twin.begin(step)?;
             self.send();
         }
-        let rays = self.next.take(step).unwrap_or_else(|| self.draw(data, cameras, step));
-        let count = rays.len();
+        let Drawn { rays, targets } = self.next.take(step).unwrap_or_else(|| self.draw(data, cameras, step));
+        let (count, moves) = (rays.len(), !targets.is_empty());
         self.context.replace(&mut self.rays, rays.as_flattened());
         self.sample(count)?;
-        self.learn(count, step);
-        // While the device learns, the next rays are drawn, where they are of the same stage.
-        if !self.twin.is_replaced_at(step + 1) {
+        self.learn(count, step, moves);
+        // While the device learns, the next rays are drawn, where they are of the same stage and their cameras stay.
+        if !moves && !self.twin.is_replaced_at(step + 1) {
             self.next.keep(step + 1, self.draw(data, cameras, step + 1));
         }
-        let losses: Vec<[f32; 2]> = self.context.read(&self.losses, count)?;
+        let parts = [(&self.losses, 2 * count), (&self.asked, RAY_GRADIENT * targets.len())];
+        let found = self.context.read_all(&parts)?;
+        let losses: &[[f32; 2]] = bytemuck::cast_slice(&found[0]);
+        let (_, factor) = self.twin.course(step);
+        correct(cameras, data, &targets, bytemuck::cast_slice(&found[1]), (factor, step));
         let mean = |i: usize| losses.iter().map(|l| f64::from(l[i])).sum::<f64>() / count as f64;
         let (samples, lit) = (self.marched.len, self.bright.len);
         Ok(StepReport { loss: mean(1), mse: mean(0) / 3.0, rays: count, samples, lit })

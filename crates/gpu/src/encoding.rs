@@ -74,9 +74,9 @@ impl Encoding {
         }
     }
 
-    fn sizes(&self, points: Points<'_>, units: f32) -> [u32; 7] {
-        let active = self.active_levels as u32;
-        [points.count as u32, self.levels, self.features, self.stride, self.first, active, units.to_bits()]
+    fn sizes(&self, points: Points<'_>, units: f32, adds: bool) -> [u32; 8] {
+        let (active, adds) = (self.active_levels as u32, u32::from(adds));
+        [points.count as u32, self.levels, self.features, self.stride, self.first, active, units.to_bits(), adds]
     }
 
     /// Numbers in a row of features.
@@ -96,27 +96,50 @@ impl Encoding {
     /// Writes `[points, stride]` features; the padding of a row is left as it is.
     pub fn forward(&self, work: &mut Work<'_>, k: &Kernels, points: Points<'_>, to: &Buffer) {
         let buffers = [(1, &self.layout), (2, points.positions), (3, &self.table.values), (4, to)];
-        work.run(&k.encode, &self.sizes(points, 0.0), &buffers, self.threads(points));
+        work.run(&k.encode, &self.sizes(points, 0.0, false), &buffers, self.threads(points));
     }
 
     /// Writes `[points, 3]` normals, by the position in -1..1: what `[points, stride]` derivatives by the features ask.
     pub fn normals(&self, work: &mut Work<'_>, k: &Kernels, points: Points<'_>, gradient: &Buffer, normals: &Buffer) {
+        self.ask_positions(work, k, points, [gradient, normals], false);
+    }
+
+    /// Adds the same to what is there.
+    pub fn add_normals(
+        &self,
+        work: &mut Work<'_>,
+        k: &Kernels,
+        points: Points<'_>,
+        gradient: &Buffer,
+        normals: &Buffer,
+    ) {
+        self.ask_positions(work, k, points, [gradient, normals], true);
+    }
+
+    fn ask_positions(
+        &self,
+        work: &mut Work<'_>,
+        k: &Kernels,
+        points: Points<'_>,
+        [gradient, normals]: [&Buffer; 2],
+        adds: bool,
+    ) {
         let table = &self.table.values;
         let buffers = [(1, &self.layout), (2, points.positions), (3, table), (4, gradient), (6, normals)];
-        work.run(&k.normals, &self.sizes(points, 0.0), &buffers, points.count);
+        work.run(&k.normals, &self.sizes(points, 0.0, adds), &buffers, points.count);
     }
 
     /// Writes `[points, stride]` tangents of the features along `[points, 3]` vectors.
     pub fn tangent(&self, work: &mut Work<'_>, k: &Kernels, points: Points<'_>, along: &Buffer, to: &Buffer) {
         let table = &self.table.values;
         let buffers = [(1, &self.layout), (2, points.positions), (3, table), (4, to), (6, along)];
-        work.run(&k.encode_tangent, &self.sizes(points, 0.0), &buffers, self.threads(points));
+        work.run(&k.encode_tangent, &self.sizes(points, 0.0, false), &buffers, self.threads(points));
     }
 
     /// Adds the derivatives of the features to `sums`, in this unit.
     pub fn scatter(&self, work: &mut Work<'_>, k: &Kernels, points: Points<'_>, d: &Buffer, unit: f32) {
         let buffers = [(1, &self.layout), (2, points.positions), (4, d), (5, &self.sums)];
-        work.run(&k.scatter, &self.sizes(points, 1.0 / unit), &buffers, self.threads(points));
+        work.run(&k.scatter, &self.sizes(points, 1.0 / unit, false), &buffers, self.threads(points));
     }
 
     /// The same with the part that derivatives of the normals ask for: g, and dn.
@@ -131,7 +154,24 @@ impl Encoding {
     ) {
         let buffers =
             [(1, &self.layout), (2, points.positions), (4, d), (5, &self.sums), (6, d_normals), (7, gradient)];
-        work.run(&k.scatter_both, &self.sizes(points, 1.0 / unit), &buffers, self.threads(points));
+        work.run(&k.scatter_both, &self.sizes(points, 1.0 / unit, false), &buffers, self.threads(points));
+    }
+
+    /// Writes `[points, 3]` derivatives by the position in -1..1: what derivatives `d` of the features and, with g,
+    /// derivatives of the normals ask.
+    pub fn position_gradient(
+        &self,
+        work: &mut Work<'_>,
+        k: &Kernels,
+        points: Points<'_>,
+        d: &Buffer,
+        (gradient, d_normals): (&Buffer, &Buffer),
+        to: &Buffer,
+    ) {
+        let table = &self.table.values;
+        let buffers =
+            [(1, &self.layout), (2, points.positions), (3, table), (4, d), (6, d_normals), (7, gradient), (8, to)];
+        work.run(&k.position_gradient, &self.sizes(points, 0.0, false), &buffers, points.count);
     }
 
     /// One Adam step, which clears `sums`.

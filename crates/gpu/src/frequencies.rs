@@ -51,17 +51,17 @@ pub fn encode_directions(
     work.run(&k.frequencies_of_directions, &sizes, &buffers, 3 * samples.len);
 }
 
-/// Writes `[samples, 3]` normals: what `[samples, stride]` derivatives by an encoding of positions ask.
+/// Writes `[samples, coordinates]` normals: what `[samples, stride]` derivatives by an encoding of positions ask.
 pub fn normals(
     work: &mut Work<'_>,
     k: &Kernels,
     octaves: Frequencies,
-    samples: usize,
+    (samples, coordinates): (usize, usize),
     columns: Columns<'_>,
     [gradient, normals]: [&Buffer; 2],
 ) {
     let buffers = [(4, columns.to), (5, gradient), (6, normals)];
-    derive(work, &k.normals_of_frequencies, octaves, samples, columns, &buffers);
+    derive(work, &k.normals_of_frequencies, octaves, (samples, coordinates), columns, &buffers);
 }
 
 /// Writes the tangents of an encoding of positions along `[samples, 3]` vectors.
@@ -74,18 +74,32 @@ pub fn tangent(
     [along, tangent]: [&Buffer; 2],
 ) {
     let buffers = [(4, columns.to), (5, tangent), (6, along)];
-    derive(work, &k.tangent_of_frequencies, octaves, samples, columns, &buffers);
+    derive(work, &k.tangent_of_frequencies, octaves, (samples, 3), columns, &buffers);
+}
+
+/// Writes `[samples, 3]` derivatives by the position: what derivatives of the encoding and, with g, derivatives of the normals
+/// ask.
+pub fn position_gradient(
+    work: &mut Work<'_>,
+    k: &Kernels,
+    octaves: Frequencies,
+    samples: usize,
+    columns: Columns<'_>,
+    [d, gradient, d_normals, to]: [&Buffer; 4],
+) {
+    let buffers = [(4, columns.to), (5, d), (6, d_normals), (7, gradient), (8, to)];
+    derive(work, &k.position_gradient_of_frequencies, octaves, (samples, 3), columns, &buffers);
 }
 
 fn derive(
     work: &mut Work<'_>,
     kernel: &Kernel,
     octaves: Frequencies,
-    samples: usize,
+    (samples, coordinates): (usize, usize),
     columns: Columns<'_>,
     buffers: &[(u32, &Buffer)],
 ) {
-    let mut sizes = sizes(octaves, 3, samples, columns).to_vec();
+    let mut sizes = sizes(octaves, coordinates, samples, columns).to_vec();
     sizes.extend([0; 2]);
-    work.run(kernel, &sizes, buffers, 3 * samples);
+    work.run(kernel, &sizes, buffers, coordinates * samples);
 }

@@ -3,11 +3,13 @@
 use mb_job::Result;
 use mb_neural::encoding::Frequencies;
 use mb_neural::frequency_field::{DensityActivation, FrequencyField, FrequencyParameters};
+use mb_neural::sdf_field::DirectionEncoding;
 
 use crate::context::{Buffer, Context, Work};
-use crate::frequencies::{Columns, encode_directions, encode_positions};
+use crate::frequencies::{self, Columns, encode_directions, encode_positions};
 use crate::kernels::Kernels;
 use crate::network::Network;
+use crate::ray_gradients::{self, ByColor, ByPosition, Coordinates};
 use crate::rays::Samples;
 use crate::trained::AdamStep;
 
@@ -25,6 +27,7 @@ pub struct FrequencyNetworks {
     encoded: Buffer,
     head_in: Buffer,
     d_trunk: Buffer,
+    d_positions: Buffer,
     /// Density of each sample.
     pub sigma: Buffer,
     /// To be filled before [`Self::backward`]: derivatives of the trunk's output 0, and of the colours before their sigmoid.
@@ -50,6 +53,7 @@ impl FrequencyNetworks {
             encoded: none(),
             head_in: none(),
             d_trunk: none(),
+            d_positions: none(),
             sigma: none(),
             d_density: none(),
             d_color: none(),
@@ -70,6 +74,11 @@ impl FrequencyNetworks {
         }
         self.trunk.reserve(context, n);
         self.head.reserve(context, n);
+    }
+
+    /// Makes room for what [`Self::ray_gradients`] leaves of so many samples.
+    pub fn reserve_gradients(&mut self, context: &Context, n: usize) {
+        context.reserve(&mut self.d_positions, n * self.coordinates);
     }
 
     /// How density follows from the trunk's output 0, as composite.wgsl numbers it.
@@ -112,6 +121,30 @@ impl FrequencyNetworks {
         let join = [(4, &self.d_trunk), (5, self.head.d_input()), (6, &self.d_density)];
         work.run(&k.join_frequencies, &self.sizes(n), &join, n * self.trunk.out_stride());
         self.trunk.backward(work, k, &self.encoded, &self.d_trunk, n);
+    }
+
+    /// After [`Self::backward`]: adds to `[rays, 8]` numbers, which begin at number `4 first` of a buffer, what the losses ask
+    /// of the rays.
+    pub fn ray_gradients(
+        &self,
+        work: &mut Work<'_>,
+        k: &Kernels,
+        rays: (&Buffer, usize),
+        s: &Samples,
+        of: Coordinates,
+        to: (&Buffer, usize),
+    ) {
+        let (d, columns) = (&self.d_positions, Columns { to: &self.encoded, stride: self.trunk_stride, first: 0 });
+        let size = (s.len, self.coordinates);
+        frequencies::normals(work, k, self.position, size, columns, [self.trunk.d_input(), d]);
+        let color = ByColor {
+            d: self.head.d_input(),
+            stride: self.head_stride,
+            with_position: false,
+            first: self.features,
+            direction: Some(DirectionEncoding::Frequencies(self.direction.0)),
+        };
+        ray_gradients::add(work, k, rays, s, (ByPosition { d, of, scale: [1.0; 3] }, color), to);
     }
 
     /// One Adam step.

@@ -3,7 +3,7 @@
 use crate::context::{Context, Kernel};
 
 /// Sources, by file name.
-pub const SOURCES: [(&str, &str); 15] = [
+pub const SOURCES: [(&str, &str); 16] = [
     ("adam", include_str!("kernels/adam.wgsl")),
     ("composite", include_str!("kernels/composite.wgsl")),
     ("dense", include_str!("kernels/dense.wgsl")),
@@ -14,6 +14,7 @@ pub const SOURCES: [(&str, &str); 15] = [
     ("importance", include_str!("kernels/importance.wgsl")),
     ("keep", include_str!("kernels/keep.wgsl")),
     ("march", include_str!("kernels/march.wgsl")),
+    ("ray_gradient", include_str!("kernels/ray_gradient.wgsl")),
     ("sections", include_str!("kernels/sections.wgsl")),
     ("skip", include_str!("kernels/skip.wgsl")),
     ("surface", include_str!("kernels/surface.wgsl")),
@@ -37,6 +38,7 @@ pub struct Kernels {
     pub encode_tangent: Kernel,
     pub scatter: Kernel,
     pub scatter_both: Kernel,
+    pub position_gradient: Kernel,
     pub density: Kernel,
     pub note: Kernel,
     pub split: Kernel,
@@ -66,6 +68,8 @@ pub struct Kernels {
     pub frequencies_of_directions: Kernel,
     pub normals_of_frequencies: Kernel,
     pub tangent_of_frequencies: Kernel,
+    pub position_gradient_of_frequencies: Kernel,
+    pub ray_gradient: Kernel,
     pub sum_up: Kernel,
     pub send_to_lengths: Kernel,
     pub normalise: Kernel,
@@ -94,6 +98,7 @@ impl Kernels {
             importance,
             keep,
             march,
+            ray_gradient,
             sections,
             skip,
             surface,
@@ -118,6 +123,7 @@ impl Kernels {
             encode_tangent: kernel(encode, "tangent"),
             scatter: kernel(encode, "scatter"),
             scatter_both: kernel(encode, "scatter_both"),
+            position_gradient: kernel(encode, "position_gradient"),
             density: kernel(field, "density"),
             note: kernel(field, "note"),
             split: kernel(field, "split"),
@@ -146,6 +152,8 @@ impl Kernels {
             frequencies_of_directions: kernel(frequencies, "of_directions"),
             normals_of_frequencies: kernel(frequencies, "normals_of"),
             tangent_of_frequencies: kernel(frequencies, "tangent"),
+            position_gradient_of_frequencies: kernel(frequencies, "position_gradient"),
+            ray_gradient: kernel(ray_gradient, "add"),
             sum_up: kernel(gains, "sum_up"),
             send_to_lengths: kernel(gains, "send"),
             normalise: kernel(gains, "normalise"),

@@ -13,7 +13,7 @@
 //! Every kernel has a twin on the processor, to which the tests compare it. Sums that meet in one place are added as
 //! whole numbers or in a fixed order, so a run's result does not depend on the order of threads.
 //!
-//! Limits: fixed cameras; a hash encoding in `neus` of the preset `fast` and frequencies in that of `paper`; rendering and extraction run on the processor.
+//! Limits: a hash encoding in `neus` of the preset `fast` and frequencies in that of `paper`; rendering and extraction run on the processor.
 
 use std::str::FromStr;
 
@@ -48,6 +48,8 @@ mod neus_original;
 mod on_device;
 #[cfg(feature = "wgpu")]
 mod radiance;
+#[cfg(feature = "wgpu")]
+mod ray_gradients;
 #[cfg(feature = "wgpu")]
 mod rays;
 #[cfg(feature = "wgpu")]
@@ -102,9 +104,6 @@ pub fn device(choice: DeviceChoice, options: &FieldOptions) -> Result<Box<dyn De
 fn unsupported(options: &FieldOptions) -> Option<&'static str> {
     let hashed = |position| matches!(position, PositionEncoding::Hash(_));
     match &options.method {
-        _ if options.cameras.refine_poses || options.cameras.refine_focal => {
-            Some("a GPU cannot correct cameras in training yet")
-        }
         Method::Neus(neus) if !hashed(neus.field.position) => {
             Some("a GPU trains neus with frequencies only as published, with the preset paper")
         }
@@ -194,9 +193,17 @@ mod choices {
         assert_eq!("auto".parse(), Ok(DeviceChoice::Auto));
         assert_eq!("gpu:3".parse(), Ok(DeviceChoice::Gpu(Some(3))));
         assert!("gpu:x".parse::<DeviceChoice>().is_err() && "".parse::<DeviceChoice>().is_err());
-        let mut neus = FieldOptions::preset("neus", "paper", 0).expect("a preset");
-        neus.cameras.refine_poses = true;
-        let Err(error) = device(DeviceChoice::Gpu(None), &neus) else { panic!("no GPU corrects cameras") };
+        for (name, preset) in
+            [("nerf", "fast"), ("nerf", "paper"), ("dvgo", "paper"), ("neus", "fast"), ("neus", "paper")]
+        {
+            let mut options = FieldOptions::preset(name, preset, 0).expect("a preset");
+            (options.cameras.refine_poses, options.cameras.refine_focal) = (true, true);
+            assert_eq!(unsupported(&options), None, "{name} {preset}");
+        }
+        let mut neus = FieldOptions::preset("neus", "fast", 0).expect("a preset");
+        let Method::Neus(options) = &mut neus.method else { panic!("another method") };
+        options.field.position = PositionEncoding::Frequencies(6);
+        let Err(error) = device(DeviceChoice::Gpu(None), &neus) else { panic!("no GPU trains it") };
         assert!(error.to_string().contains("--device cpu"), "{error}");
         assert_eq!(device(DeviceChoice::Auto, &neus).expect("the processor").name(), "the processor");
     }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use mb_job::{Result, rng};
 use mb_neural::cameras::CameraResiduals;
-use mb_neural::dataset::RayDataset;
+use mb_neural::dataset::{RayDataset, TargetRay};
 use mb_neural::model::{GROUPS, StepReport};
 use mb_neural::nerf::{DARK, Nerf};
 use mb_neural::occupancy::{CELL_MEMORY, looks_everywhere};
@@ -17,6 +17,7 @@ use crate::encoding::unit_of;
 use crate::kernels::Kernels;
 use crate::on_device::Learner;
 use crate::radiance::Radiance;
+use crate::ray_gradients::{RAY_GRADIENT, correct};
 use crate::rays::{Ahead, Rays, Samples, Space, occupied, pack};
 
 /// A NeRF whose twin holds all that is not of the device, and, after a fetch, all that the device has learned.
@@ -30,13 +31,22 @@ pub struct GpuNerf {
     samples: Samples,
     weights: Buffer,
     losses: Buffer,
+    /// What the losses ask of the rays, where a step moves the cameras.
+    asked: Buffer,
     next: Ahead<Counted>,
 }
 
 /// Rays that the device has, and how many samples each has.
 struct Counted {
-    rays: usize,
+    drawn: Drawn,
     counts: Vec<u32>,
+}
+
+/// Rays of a step, where it moves the cameras also as they were drawn.
+#[derive(Default)]
+struct Drawn {
+    rays: usize,
+    targets: Vec<TargetRay>,
 }
 
 impl GpuNerf {
@@ -51,15 +61,16 @@ impl GpuNerf {
             samples: Samples::new(c),
             weights: c.zeros(0),
             losses: c.zeros(0),
+            asked: c.zeros(0),
             next: Ahead::none(),
             twin,
             context,
         }
     }
 
-    /// Draws the rays of a step, as the twin does, and counts their samples; how many rays they are.
-    fn begin(&mut self, data: &RayDataset, cameras: &CameraResiduals, step: u64) -> usize {
-        let (options, rays) = (&self.twin.options, self.twin.rays_of_group());
+    /// Draws the rays of a step, as the twin does, and counts their samples.
+    fn begin(&mut self, data: &RayDataset, cameras: &CameraResiduals, step: u64) -> Drawn {
+        let (options, rays, moves) = (&self.twin.options, self.twin.rays_of_group(), cameras.wants_gradients(step));
         let drawn = (0..GROUPS as u64).into_par_iter().map(|group| {
             let (mut rng, mut targets) = (rng(options.seed, step * GROUPS as u64 + group), Vec::new());
             data.draw(&mut rng, rays, cameras, &mut targets);
@@ -68,14 +79,16 @@ impl GpuNerf {
                 let wanted = target.before(background, options.object_only);
                 pack(target, rng.random(), background, wanted, options.near)
             });
-            packed.collect::<Vec<_>>()
+            let packed = packed.collect::<Vec<_>>();
+            (packed, if moves { targets } else { Vec::new() })
         });
-        let drawn = drawn.collect::<Vec<_>>().concat();
+        let (drawn, targets): (Vec<_>, Vec<_>) = drawn.unzip();
+        let drawn = drawn.concat();
         let (context, space) = (&*self.context, self.space());
         context.replace(&mut self.rays, drawn.as_flattened());
         let rays = Rays { rays: &self.rays, count: drawn.len(), occupied: &self.occupied };
         self.samples.count(context, &self.kernels, &space, rays);
-        drawn.len()
+        Drawn { rays: drawn.len(), targets: targets.concat() }
     }
 
     fn space(&self) -> Space {
@@ -83,13 +96,18 @@ impl GpuNerf {
         Space { resolution: o.occupancy, far: o.far, step: o.step, cone: o.cone, inside_ball: false, voxels: None }
     }
 
-    /// Forward, loss, backward and Adam; the losses stay in `self.losses`.
-    fn learn(&mut self, count: usize, lr: f32, t: u64) {
+    /// Forward, loss, backward and Adam; the losses stay in `self.losses`, and, where the step moves the cameras, what they ask
+    /// of the rays in `self.asked`.
+    fn learn(&mut self, count: usize, lr: f32, t: u64, moves: bool) {
         let context = &*self.context;
         let n = self.samples.len;
         self.field.reserve(context, n);
         context.reserve(&mut self.weights, n);
         context.reserve(&mut self.losses, 2 * count);
+        if moves {
+            self.field.reserve_gradients(context, n);
+            context.reserve(&mut self.asked, RAY_GRADIENT * count);
+        }
         let (k, f, s, rays) = (&self.kernels, &self.field, &self.samples, &self.rays);
         let mut work = context.work();
         f.forward(&mut work, k, rays, s);
@@ -109,6 +127,10 @@ impl GpuNerf {
         work.run(&k.losses, &[count as u32, floats[0], floats[1], floats[2], 0], &losses, count * WORKGROUP);
         let unit = unit_of(scale);
         f.backward(&mut work, k, s, unit);
+        if moves {
+            work.clear(&self.asked);
+            f.ray_gradients(&mut work, k, (rays, count), s, (&self.asked, 0));
+        }
         f.step(&mut work, k, unit, lr, t);
         work.submit();
     }
@@ -142,30 +164,36 @@ impl Learner for GpuNerf {
         let counted = match self.next.take(step) {
             Some(counted) => counted,
             None => {
-                let rays = self.begin(data, cameras, step);
-                Counted { rays, counts: self.context.read(&self.samples.counts, rays)? }
+                let drawn = self.begin(data, cameras, step);
+                let counts = self.context.read(&self.samples.counts, drawn.rays)?;
+                Counted { drawn, counts }
             }
         };
-        let (count, space) = (counted.rays, self.space());
+        let Drawn { rays: count, targets } = counted.drawn;
+        let (moves, space) = (!targets.is_empty(), self.space());
         let rays = Rays { rays: &self.rays, count, occupied: &self.occupied };
         self.samples.place(&self.context, &self.kernels, &space, rays, &counted.counts);
         let options = &self.twin.options;
-        let (lr, every) = (options.learning_rate * options.schedule.factor(step + 1), options.occupancy_every);
-        let samples = self.samples.len;
-        self.learn(count, lr, step + 1);
+        let (factor, every) = (options.schedule.factor(step + 1), options.occupancy_every);
+        let (lr, samples) = (options.learning_rate * factor, self.samples.len);
+        self.learn(count, lr, step + 1, moves);
         self.twin.count_samples(samples, count);
-        // While the device learns, the next rays are drawn; what is refreshed first counts their samples itself.
+        // While the device learns, the next rays are drawn, where their cameras stay; what is refreshed first counts their samples
+        // itself.
         let refreshed = (step + 1).is_multiple_of(every);
-        let next = if refreshed { 0 } else { self.begin(data, cameras, step + 1) };
-        let mut found = self.context.read_all(&[(&self.losses, 2 * count), (&self.samples.counts, next)])?;
+        let next = if refreshed || moves { Drawn::default() } else { self.begin(data, cameras, step + 1) };
+        let asked = RAY_GRADIENT * targets.len();
+        let parts = [(&self.losses, 2 * count), (&self.asked, asked), (&self.samples.counts, next.rays)];
+        let mut found = self.context.read_all(&parts)?;
         let counts = found.pop().unwrap_or_default();
+        correct(cameras, data, &targets, bytemuck::cast_slice(&found[1]), (factor, step));
         let sum = |i: usize| found[0].iter().skip(i).step_by(2).map(|l| f64::from(f32::from_bits(*l))).sum::<f64>();
         let mse = sum(0) / (3 * count) as f64;
         let loss = mse + f64::from(self.twin.options.distortion) * sum(1) / count as f64;
         if refreshed {
             self.refresh_occupancy((step + 1) / every)?;
-        } else {
-            self.next.keep(step + 1, Counted { rays: next, counts });
+        } else if !moves {
+            self.next.keep(step + 1, Counted { drawn: next, counts });
         }
         Ok(StepReport { loss, mse, rays: count, samples, lit: samples })
     }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use mb_job::{Result, rng};
 use mb_neural::cameras::CameraResiduals;
-use mb_neural::dataset::RayDataset;
+use mb_neural::dataset::{RayDataset, TargetRay};
 use mb_neural::model::{GROUPS, StepReport};
 use mb_neural::nerf_original::{ADAM, NerfOriginal, TILE_RAYS};
 use rand::RngExt as _;
@@ -15,6 +15,7 @@ use crate::context::{Buffer, Context, WORKGROUP};
 use crate::frequency_field::FrequencyNetworks;
 use crate::kernels::Kernels;
 use crate::on_device::Learner;
+use crate::ray_gradients::{Coordinates, RAY_GRADIENT, correct};
 use crate::rays::{RAY, Samples, pack};
 use crate::trained::AdamStep;
 
@@ -36,14 +37,18 @@ pub struct GpuNerfOriginal {
     kernels: Kernels,
     coarse: Pass,
     fine: Pass,
+    /// What the losses of some rays ask of them, where a step moves the cameras.
+    asked: Buffer,
     /// Samples that go through a network at once, at most.
     pub most_samples: usize,
 }
 
-/// What a step is given: rays, and for each the distances of its coarse samples and the random numbers of its fine ones.
+/// What a step is given: rays, where it moves the cameras also as they were drawn, and for each the distances of its coarse
+/// samples and the random numbers of its fine ones.
 #[derive(Default)]
 struct Drawn {
     rays: Vec<[f32; RAY]>,
+    targets: Vec<TargetRay>,
     depths: Vec<f32>,
     random: Vec<f32>,
 }
@@ -64,8 +69,16 @@ impl Pass {
         self.samples.starts = context.upload(&starts);
     }
 
-    /// Colours and losses of the samples, and their derivatives; `scale` is 1 / (3 rays of the step).
-    fn learn(&self, context: &Context, k: &Kernels, (rays, count): (&Buffer, usize), scale: f32) {
+    /// Colours and losses of the samples, and their derivatives; `scale` is 1 / (3 rays of the step). Adds what the losses ask
+    /// of the rays, where somebody asks, given of what the samples' positions are coordinates.
+    fn learn(
+        &self,
+        context: &Context,
+        k: &Kernels,
+        (rays, count): (&Buffer, usize),
+        scale: f32,
+        asked: Option<(&Buffer, Coordinates)>,
+    ) {
         let (f, s) = (&self.field, &self.samples);
         let mut work = context.work();
         f.forward(&mut work, k, rays, s);
@@ -84,6 +97,9 @@ impl Pass {
         ];
         work.run(&k.losses, &sizes, &losses, count * WORKGROUP);
         f.backward(&mut work, k, s);
+        if let Some((asked, of)) = asked {
+            f.ray_gradients(&mut work, k, (rays, count), s, of, (asked, 0));
+        }
         work.submit();
     }
 }
@@ -93,7 +109,8 @@ impl GpuNerfOriginal {
     pub fn new(twin: NerfOriginal, context: Arc<Context>) -> Self {
         let pass = |p| Pass::new(&context, FrequencyNetworks::new(&context, &twin.field, p));
         let (coarse, fine) = (pass(&twin.coarse), pass(&twin.fine));
-        Self { kernels: Kernels::new(&context), coarse, fine, most_samples: SAMPLES, twin, context }
+        let (kernels, asked) = (Kernels::new(&context), context.zeros(0));
+        Self { kernels, coarse, fine, asked, most_samples: SAMPLES, twin, context }
     }
 
     /// The rays and random numbers of a step, as the twin draws them.
@@ -117,12 +134,22 @@ impl GpuNerfOriginal {
                 let random = tile.len() * twin.options.fine_samples;
                 drawn.random.extend((0..random).map(|_| rng.random::<f32>()));
             }
+            if cameras.wants_gradients(step) {
+                drawn.targets.extend_from_slice(&rays);
+            }
         }
         drawn
     }
 
-    /// Both passes of some rays; the squared errors of each ray, by the coarse and the fine network.
-    fn learn(&mut self, rays: &[[f32; RAY]], depths: &[f32], random: &[f32], scale: f32) -> Result<[f64; 2]> {
+    /// Both passes of some rays; the squared errors of all, by the coarse and the fine network, and, where the step moves the
+    /// cameras, what the losses ask of each ray.
+    fn learn(
+        &mut self,
+        rays: &[[f32; RAY]],
+        depths: &[f32],
+        random: &[f32],
+        (scale, moves): (f32, bool),
+    ) -> Result<([f64; 2], Vec<u32>)> {
         let (context, k, o, count) = (&*self.context, &self.kernels, &self.twin.options, rays.len());
         let sizes = [count, o.coarse_samples, o.fine_samples, usize::from(self.twin.with_masks)].map(|n| n as u32);
         let rays = context.upload(rays.as_flattened());
@@ -130,11 +157,16 @@ impl GpuNerfOriginal {
         let (coarse, fine) = (&mut self.coarse.samples, &mut self.fine.samples);
         coarse.len = count * o.coarse_samples;
         fine.len = count * (o.coarse_samples + o.fine_samples);
+        let of = if self.twin.with_masks { Coordinates::Scene } else { Coordinates::Contracted };
+        let asked = moves.then_some((&self.asked, of));
         let mut work = context.work();
+        if moves {
+            work.clear(&self.asked);
+        }
         let placed = [(1, &rays), (2, &depths), (5, &coarse.positions), (6, &coarse.steps), (7, &coarse.ray_of)];
         work.run(&k.place_samples, &sizes, &placed, count);
         work.submit();
-        self.coarse.learn(context, k, (&rays, count), scale);
+        self.coarse.learn(context, k, (&rays, count), scale, asked);
         let (coarse, fine) = (&self.coarse, &self.fine.samples);
         let mut work = context.work();
         let drawn = [
@@ -148,13 +180,13 @@ impl GpuNerfOriginal {
         ];
         work.run(&k.draw_samples, &sizes, &drawn, count);
         work.submit();
-        self.fine.learn(context, k, (&rays, count), scale);
-        let mut sums = [0.0; 2];
-        for (sum, pass) in sums.iter_mut().zip([&self.coarse, &self.fine]) {
-            let losses: Vec<[f32; 2]> = context.read(&pass.losses, count)?;
-            *sum = losses.iter().map(|l| f64::from(l[0])).sum();
-        }
-        Ok(sums)
+        self.fine.learn(context, k, (&rays, count), scale, asked);
+        let losses = [&self.coarse, &self.fine].map(|pass| (&pass.losses, 2 * count));
+        let asked = (&self.asked, if moves { RAY_GRADIENT * count } else { 0 });
+        let mut found = context.read_all(&[losses[0], losses[1], asked])?;
+        let asked = found.pop().unwrap_or_default();
+        let squared = |losses: &[u32]| losses.iter().step_by(2).map(|l| f64::from(f32::from_bits(*l))).sum();
+        Ok(([squared(&found[0]), squared(&found[1])], asked))
     }
 }
 
@@ -171,19 +203,27 @@ impl Learner for GpuNerfOriginal {
 
     fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
         let drawn = self.draw(data, cameras, step);
-        let (count, o) = (drawn.rays.len(), &self.twin.options);
+        let (count, moves, o) = (drawn.rays.len(), !drawn.targets.is_empty(), &self.twin.options);
         let (coarse, fine) = (o.coarse_samples, o.fine_samples);
-        let lr = o.learning_rate * o.schedule.factor(step);
+        let factor = o.schedule.factor(step);
+        let lr = o.learning_rate * factor;
         let parts = count.div_ceil((self.most_samples / (coarse + fine)).max(1));
         let at_once = count.div_ceil(parts);
         self.coarse.reserve(&self.context, at_once, coarse);
         self.fine.reserve(&self.context, at_once, coarse + fine);
-        let mut sums = [0.0; 2];
+        if moves {
+            self.coarse.field.reserve_gradients(&self.context, at_once * coarse);
+            self.fine.field.reserve_gradients(&self.context, at_once * (coarse + fine));
+            self.context.reserve(&mut self.asked, RAY_GRADIENT * at_once);
+        }
+        let (mut sums, mut asked) = ([0.0; 2], Vec::new());
         let parts = drawn.rays.chunks(at_once).zip(drawn.depths.chunks(at_once * coarse));
         for ((rays, depths), random) in parts.zip(drawn.random.chunks(at_once * fine)) {
-            let found = self.learn(rays, depths, random, 1.0 / (3 * count) as f32)?;
+            let (found, of_rays) = self.learn(rays, depths, random, (1.0 / (3 * count) as f32, moves))?;
             (0..2).for_each(|pass| sums[pass] += found[pass]);
+            asked.extend(of_rays);
         }
+        correct(cameras, data, &drawn.targets, bytemuck::cast_slice(&asked), (factor, step));
         let mut work = self.context.work();
         for pass in [&self.coarse, &self.fine] {
             pass.field.step(&mut work, &self.kernels, &AdamStep { options: ADAM, lr, t: step + 1 });

@@ -18,6 +18,7 @@ use crate::encoding::unit_of;
 use crate::kernels::Kernels;
 use crate::on_device::Learner;
 use crate::radiance::Radiance;
+use crate::ray_gradients::{RAY_GRADIENT, correct};
 use crate::rays::{Ahead, RAY, Rays, Samples, Space, occupied, pack};
 use crate::surface::Surface;
 use crate::trained::AdamStep;
@@ -40,9 +41,12 @@ pub struct GpuNeus {
     next: Ahead<Drawn>,
 }
 
-/// What a step is given: the rays, and the points of the ball that belong to none.
+/// What a step is given: the rays, where it moves the cameras also as they were drawn, and the points of the ball that belong to
+/// none.
+#[derive(Default)]
 struct Drawn {
     rays: Vec<[f32; RAY]>,
+    targets: Vec<TargetRay>,
     free: Vec<[f32; 3]>,
 }
 
@@ -72,7 +76,7 @@ impl GpuNeus {
 
     /// Rays and free points of a step, as the twin draws them.
     fn draw(&self, data: &RayDataset, cameras: &CameraResiduals, step: u64) -> Drawn {
-        let twin = &self.twin;
+        let (twin, moves) = (&self.twin, cameras.wants_gradients(step));
         let groups: Vec<Drawn> = (0..GROUPS as u64)
             .into_par_iter()
             .map(|group| {
@@ -91,12 +95,14 @@ impl GpuNeus {
                 };
                 let rays = targets.iter().map(pack).collect();
                 let point = |_| std::array::from_fn(|_| 0.5 * rng.random_range(-1.0..1.0f32) + 0.5);
-                Drawn { rays, free: (0..FREE_POINTS).map(point).collect() }
+                let free = (0..FREE_POINTS).map(point).collect();
+                Drawn { rays, targets: if moves { targets } else { Vec::new() }, free }
             })
             .collect();
-        let mut drawn = Drawn { rays: Vec::new(), free: Vec::new() };
+        let mut drawn = Drawn::default();
         for group in groups {
             drawn.rays.extend(group.rays);
+            drawn.targets.extend(group.targets);
             drawn.free.extend(group.free);
         }
         drawn
@@ -139,13 +145,18 @@ impl GpuNeus {
         Ok(())
     }
 
-    /// Forward, loss, backward and Adam; the losses stay in `self.losses`.
-    fn learn(&mut self, count: usize, free: usize, step: u64) {
+    /// Forward, loss, backward and Adam; the losses stay in `self.losses`, behind them, where the step moves the cameras, what
+    /// they ask of the rays.
+    fn learn(&mut self, count: usize, free: usize, step: u64, moves: bool) {
         let (context, rays) = (&*self.context, &self.rays);
         let (n, rows) = (self.inner.len, self.inner.len + free);
         self.surface.reserve(context, rows);
         self.outside.reserve(context, self.outer.len);
-        context.reserve(&mut self.losses, 4 * count);
+        if moves {
+            self.surface.reserve_gradients(context, n);
+            self.outside.reserve_gradients(context, self.outer.len);
+        }
+        context.reserve(&mut self.losses, (4 + RAY_GRADIENT) * count);
         let (k, twin, f, out) = (&self.kernels, &self.twin, &self.surface, &self.outside);
         let o = &twin.options;
         let mut work = context.work();
@@ -190,12 +201,20 @@ impl GpuNeus {
         work.run(&k.free_points, &sizes, &[(5, &f.normals)], free);
         let unit = unit_of(1.0 / count as f32);
         f.backward(&mut work, k, &self.inner, rows, unit);
+        let rays = (rays, count);
+        let asked = (&self.losses, count);
+        if moves {
+            f.ray_gradients(&mut work, k, rays, &self.inner, asked);
+        }
         let (factor, t) = (o.schedule.factor(step + 1), step + 1);
         let table = o.table_learning_rate * factor;
         let step = |lr| AdamStep { options: ADAM, lr, t };
         f.step(&mut work, k, unit, [step(table), step(o.learning_rate * factor)]);
         if !twin.with_masks {
             out.backward(&mut work, k, &self.outer, unit);
+            if moves {
+                out.ray_gradients(&mut work, k, rays, &self.outer, asked);
+            }
             out.step(&mut work, k, unit, table, t);
         }
         work.submit();
@@ -236,16 +255,23 @@ impl Learner for GpuNeus {
     fn step(&mut self, data: &RayDataset, cameras: &mut CameraResiduals, step: u64) -> Result<StepReport> {
         self.twin.set_levels(step);
         self.surface.set_levels(self.twin.field.active_levels);
-        let Drawn { rays, free } = self.next.take(step).unwrap_or_else(|| self.draw(data, cameras, step));
+        let Drawn { rays, targets, free } = self.next.take(step).unwrap_or_else(|| self.draw(data, cameras, step));
+        let moves = !targets.is_empty();
         let count = rays.len();
         self.context.replace(&mut self.rays, rays.as_flattened());
         self.march(count)?;
         self.keep(count, &free)?;
-        self.learn(count, free.len(), step);
+        self.learn(count, free.len(), step, moves);
         self.twin.count_samples(self.marched.len, count);
-        // While the device learns, the next rays are drawn.
-        self.next.keep(step + 1, self.draw(data, cameras, step + 1));
-        let losses: Vec<[f32; 4]> = self.context.read(&self.losses, count)?;
+        // While the device learns, the next rays are drawn, where their cameras stay.
+        if !moves {
+            self.next.keep(step + 1, self.draw(data, cameras, step + 1));
+        }
+        let found: Vec<f32> = self.context.read(&self.losses, 4 * count + RAY_GRADIENT * targets.len())?;
+        let (losses, asked) = found.split_at(4 * count);
+        let losses = losses.as_chunks::<4>().0;
+        let factor = self.twin.options.schedule.factor(step + 1);
+        correct(cameras, data, &targets, asked.as_chunks().0, (factor, step));
         let sum = |i: usize| losses.iter().map(|l| f64::from(l[i])).sum::<f64>();
         let (mse, loss) = (sum(0) / (3 * count) as f64, sum(1) / count as f64);
         self.twin.step_sharpness(sum(2) as f32, step + 1);

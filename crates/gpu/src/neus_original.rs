@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use mb_job::{Result, rng};
 use mb_neural::cameras::CameraResiduals;
-use mb_neural::dataset::RayDataset;
+use mb_neural::dataset::{RayDataset, TargetRay};
 use mb_neural::model::{GROUPS, StepReport};
 use mb_neural::neus_original::{ADAM, NeusOriginal, RELAXED, TILE_RAYS, round_sharpness};
 
@@ -15,6 +15,7 @@ use crate::encoding::{Points, unit_of};
 use crate::frequency_field::FrequencyNetworks;
 use crate::kernels::Kernels;
 use crate::on_device::Learner;
+use crate::ray_gradients::{Coordinates, RAY_GRADIENT, correct};
 use crate::rays::{RAY, Samples, pack, starts};
 use crate::surface::Surface;
 use crate::trained::AdamStep;
@@ -48,10 +49,12 @@ pub struct GpuNeusOriginal {
     losses: Buffer,
 }
 
-/// What a step is given: rays, and of each the even starts of sections and those behind the ball.
+/// What a step is given: rays, where it moves the cameras also as they were drawn, and of each the even starts of sections and
+/// those behind the ball.
 #[derive(Default)]
 struct Drawn {
     rays: Vec<[f32; RAY]>,
+    targets: Vec<TargetRay>,
     depths: Vec<f32>,
     outside: Vec<f32>,
 }
@@ -112,6 +115,9 @@ impl GpuNeusOriginal {
                 let mut ray = pack(target, 0.0, [0.0; 3], target.rgb, 0.0);
                 ray[16] = target.mask.filter(|_| twin.with_masks).unwrap_or(-1.0);
                 drawn.rays.push(ray);
+            }
+            if cameras.wants_gradients(step) {
+                drawn.targets.extend_from_slice(&rays);
             }
         }
         drawn
@@ -218,13 +224,18 @@ impl GpuNeusOriginal {
         Ok(())
     }
 
-    /// Forward, loss, backward and Adam; the losses stay in `self.losses`.
-    fn learn(&mut self, rays: &Buffer, count: usize, step: u64) {
+    /// Forward, loss, backward and Adam; the losses stay in `self.losses`, behind them, where the step moves the cameras, what
+    /// they ask of the rays.
+    fn learn(&mut self, rays: &Buffer, count: usize, step: u64, moves: bool) {
         let context = &*self.context;
         let n = self.inner.len;
         self.surface.reserve(context, n);
         self.outside.reserve(context, self.outer.len);
-        context.reserve(&mut self.losses, 4 * count);
+        if moves {
+            self.surface.reserve_gradients(context, n);
+            self.outside.reserve_gradients(context, self.outer.len);
+        }
+        context.reserve(&mut self.losses, (4 + RAY_GRADIENT) * count);
         let (k, twin, f, out) = (&self.kernels, &self.twin, &self.surface, &self.outside);
         let o = &twin.options;
         let mut work = context.work();
@@ -259,9 +270,17 @@ impl GpuNeusOriginal {
         let lr = o.learning_rate * o.schedule.factor(step);
         let adam = AdamStep { options: ADAM, lr, t: step + 1 };
         f.backward(&mut work, k, &self.inner, n, unit);
+        let rays = (rays, count);
+        let asked = (&self.losses, count);
+        if moves {
+            f.ray_gradients(&mut work, k, rays, &self.inner, asked);
+        }
         f.step(&mut work, k, unit, [adam, adam]);
         if !twin.with_masks {
             out.backward(&mut work, k, &self.outer);
+            if moves {
+                out.ray_gradients(&mut work, k, rays, &self.outer, Coordinates::Inverted, asked);
+            }
             out.step(&mut work, k, &adam);
         }
         work.submit();
@@ -286,12 +305,17 @@ impl Learner for GpuNeusOriginal {
         let n = self.rounds(&rays, count, &drawn.depths);
         self.place(&mut drawn, n, &rays)?;
         let rays = self.context.upload(drawn.rays.as_flattened());
-        self.learn(&rays, count, step);
-        let losses: Vec<[f32; 4]> = self.context.read(&self.losses, count)?;
+        let targets = &drawn.targets;
+        self.learn(&rays, count, step, !targets.is_empty());
+        let found: Vec<f32> = self.context.read(&self.losses, 4 * count + RAY_GRADIENT * targets.len())?;
+        let (losses, asked) = found.split_at(4 * count);
+        let losses = losses.as_chunks::<4>().0;
         let sum = |i: usize| losses.iter().map(|l| f64::from(l[i])).sum::<f64>();
         let (mse, loss) = (sum(0) / (3 * count) as f64, sum(1) / count as f64);
         let o = &self.twin.options;
-        let lr = o.learning_rate * o.schedule.factor(step);
+        let factor = o.schedule.factor(step);
+        let lr = o.learning_rate * factor;
+        correct(cameras, data, targets, asked.as_chunks().0, (factor, step));
         self.twin.step_sharpness(sum(2) as f32, lr, step + 1);
         let samples = count * n + drawn.outside.len();
         Ok(StepReport { loss, mse, rays: count, samples, lit: samples })

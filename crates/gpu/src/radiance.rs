@@ -2,12 +2,14 @@
 
 use mb_job::Result;
 use mb_neural::radiance_field::{ADAM, RadianceField, RadianceParameters};
+use mb_neural::sdf_field::DirectionEncoding;
 use rayon::prelude::*;
 
 use crate::context::{Buffer, Context, Work};
 use crate::encoding::{Encoding, Points};
 use crate::kernels::Kernels;
 use crate::network::Network;
+use crate::ray_gradients::{self, ByColor, ByPosition, Coordinates};
 use crate::rays::Samples;
 use crate::trained::AdamStep;
 
@@ -29,6 +31,7 @@ pub struct Radiance {
     features: Buffer,
     color_in: Buffer,
     d_geometry: Buffer,
+    d_positions: Buffer,
     /// Largest density found in each cell of the occupancy grid since [`Self::seen`].
     seen: Buffer,
     resolution: usize,
@@ -52,6 +55,7 @@ impl Radiance {
             features: none(),
             color_in: none(),
             d_geometry: none(),
+            d_positions: none(),
             seen: context.zeros(resolution.pow(3)),
             resolution,
         }
@@ -71,6 +75,11 @@ impl Radiance {
         }
         self.density.reserve(context, n);
         self.color.reserve(context, n);
+    }
+
+    /// Makes room for what [`Self::ray_gradients`] leaves of so many samples.
+    pub fn reserve_gradients(&mut self, context: &Context, n: usize) {
+        context.reserve(&mut self.d_positions, 3 * n);
     }
 
     fn density_of(&self, work: &mut Work<'_>, k: &Kernels, points: Points<'_>) {
@@ -103,6 +112,24 @@ impl Radiance {
         work.run(&k.join, &self.sizes(n), &join, 16 * n);
         self.density.backward(work, k, &self.features, &self.d_geometry, n);
         self.encoding.scatter(work, k, s.points(n), self.density.d_input(), unit);
+    }
+
+    /// After [`Self::backward`]: adds to `[rays, 8]` numbers, which begin at number `4 first` of a buffer, what the losses ask
+    /// of the rays.
+    pub fn ray_gradients(
+        &self,
+        work: &mut Work<'_>,
+        k: &Kernels,
+        rays: (&Buffer, usize),
+        s: &Samples,
+        to: (&Buffer, usize),
+    ) {
+        self.encoding.normals(work, k, s.points(s.len), self.density.d_input(), &self.d_positions);
+        // In -1..1 contracted space is half as long.
+        let position = ByPosition { d: &self.d_positions, of: Coordinates::Contracted, scale: [0.5; 3] };
+        let direction = Some(DirectionEncoding::Harmonics);
+        let color = ByColor { d: self.color.d_input(), stride: 32, with_position: false, first: 16, direction };
+        ray_gradients::add(work, k, rays, s, (position, color), to);
     }
 
     /// One Adam step.

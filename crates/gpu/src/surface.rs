@@ -9,6 +9,7 @@ use crate::encoding::{Encoding, Points};
 use crate::frequencies::{self, Columns, encode_directions, encode_positions};
 use crate::kernels::Kernels;
 use crate::network::Network;
+use crate::ray_gradients::{self, ByColor, ByPosition, Coordinates};
 use crate::rays::Samples;
 use crate::trained::AdamStep;
 
@@ -45,6 +46,7 @@ pub struct Surface {
     color_in: Buffer,
     d_out: Buffer,
     d_gradient: Buffer,
+    d_positions: Buffer,
 }
 
 impl Surface {
@@ -69,6 +71,7 @@ impl Surface {
             color_in: none(),
             d_out: none(),
             d_gradient: none(),
+            d_positions: none(),
         }
     }
 
@@ -94,6 +97,11 @@ impl Surface {
         }
         self.geometry.reserve(context, n);
         self.color.reserve(context, n);
+    }
+
+    /// Makes room for what [`Self::ray_gradients`] leaves of so many samples.
+    pub fn reserve_gradients(&mut self, context: &Context, n: usize) {
+        context.reserve(&mut self.d_positions, 3 * n);
     }
 
     /// The columns of the encoded position.
@@ -150,7 +158,7 @@ impl Surface {
         match &self.position {
             Position::Hash(encoding) => encoding.normals(work, k, points, gradient, &self.normals),
             Position::Frequencies(octaves) => {
-                frequencies::normals(work, k, *octaves, rows, self.columns(), [gradient, &self.normals]);
+                frequencies::normals(work, k, *octaves, (rows, 3), self.columns(), [gradient, &self.normals]);
             }
         }
         let split = [
@@ -188,6 +196,37 @@ impl Surface {
             let second = (&self.geometry.gradient, &self.normals);
             encoding.scatter_both(work, k, points, self.geometry.d_input(), second, unit);
         }
+    }
+
+    /// After [`Self::backward`]: adds to `[rays, 8]` numbers, which begin at number `4 first` of a buffer, what the losses ask
+    /// of the rays through their samples' positions and the encoded direction.
+    pub fn ray_gradients(
+        &self,
+        work: &mut Work<'_>,
+        k: &Kernels,
+        rays: (&Buffer, usize),
+        s: &Samples,
+        to: (&Buffer, usize),
+    ) {
+        let (points, d_input, g) = (s.points(s.len), self.geometry.d_input(), &self.geometry.gradient);
+        match &self.position {
+            Position::Hash(encoding) => {
+                encoding.position_gradient(work, k, points, d_input, (g, &self.normals), &self.d_positions);
+            }
+            Position::Frequencies(octaves) => {
+                let buffers = [d_input, g, &self.normals, &self.d_positions];
+                frequencies::position_gradient(work, k, *octaves, s.len, self.columns(), buffers);
+            }
+        }
+        let position = ByPosition { d: &self.d_positions, of: Coordinates::Scene, scale: [1.0; 3] };
+        let color = ByColor {
+            d: self.color.d_input(),
+            stride: self.color_stride,
+            with_position: true,
+            first: 6,
+            direction: Some(self.direction),
+        };
+        ray_gradients::add(work, k, rays, s, (position, color), to);
     }
 
     /// One Adam step, of the table, whose gradient has this unit, and of the networks.

@@ -1,6 +1,7 @@
 //! Every kernel beside its twin on the processor, on whatever device this machine has (in continuous integration a
 //! software one).
 
+mod cameras;
 mod training;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -190,7 +191,7 @@ fn frequencies_agree_with_their_twins() {
     let (found_normals, found_tangents) = (context.zeros(3 * n), context.zeros(n * stride));
     let of = Columns { to: &encoded, ..columns };
     let mut work = context.work();
-    frequencies::normals(&mut work, &k, Frequencies(6), n, of, [&g, &found_normals]);
+    frequencies::normals(&mut work, &k, Frequencies(6), (n, 3), of, [&g, &found_normals]);
     frequencies::tangent(&mut work, &k, Frequencies(6), n, of, [&v, &found_tangents]);
     work.submit();
     agree("normals", &context.read(&found_normals, 3 * n).expect("read"), normals.as_flattened(), 1e-5);

@@ -1,6 +1,7 @@
 // Tables of numbers at the corners of grids, sampled trilinearly: the multi-resolution hash encoding and dense voxels; their
 // gradient and their scatter. Twins: `HashGrid`, whose module has the formulas, and `DenseGrid`.
-// One thread for each sample, level and four of its features, but for `normals_of`: one for each sample.
+// One thread for each sample, level and four of its features, but for `normals_of` and `position_gradient`: one for each
+// sample.
 
 const PART = 4u;
 
@@ -16,6 +17,8 @@ struct Sizes {
     active_levels: u32,
     // `scatter`: units of the sums in 1.
     units: f32,
+    // `normals_of`: 1 where it adds to what is there.
+    adds: u32,
 }
 
 struct Level {
@@ -33,14 +36,17 @@ var<immediate> sizes: Sizes;
 // [samples, 3]: position in the unit cube.
 @group(0) @binding(2) var<storage, read> positions: array<f32>;
 @group(0) @binding(3) var<storage, read> table: array<f32>;
-// [samples, stride]: `forward` and `tangent` write features, the scatters read their derivatives, `normals` reads g.
+// [samples, stride]: `forward` and `tangent` write features, the scatters and `position_gradient` read their derivatives,
+// `normals_of` reads g.
 @group(0) @binding(4) var<storage, read_write> features: array<f32>;
 // Derivatives of the table as whole numbers of 64 bits: low and high word of each.
 @group(0) @binding(5) var<storage, read_write> sums: array<atomic<u32>>;
-// [samples, 3]: `normals` writes n, `tangent` and `scatter_both` read dn; by the position in -1..1.
+// [samples, 3]: `normals_of` writes n, the others read dn; by the position in -1..1.
 @group(0) @binding(6) var<storage, read_write> normals: array<f32>;
 // [samples, stride]: g.
 @group(0) @binding(7) var<storage, read> gradient: array<f32>;
+// [samples, 3]: derivatives by the position in -1..1.
+@group(0) @binding(8) var<storage, read_write> d_positions: array<f32>;
 
 struct Cell {
     base: vec3<u32>,
@@ -132,6 +138,11 @@ fn normal_of(sample: u32) -> vec3<f32> {
     return vec3(normals[3u * sample], normals[3u * sample + 1u], normals[3u * sample + 2u]);
 }
 
+// What the columns before the encoding have of a derivative by the position: all of it, where they are the position.
+fn own_column(sample: u32, d: u32) -> f32 {
+    return select(0.0, features[sample * sizes.stride + d], sizes.first == 3u);
+}
+
 // The positions of the unit cube are half as long as those in -1..1.
 @compute @workgroup_size(64)
 fn normals_of(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
@@ -152,7 +163,46 @@ fn normals_of(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgro
         }
     }
     for (var d = 0u; d < 3u; d += 1u) {
-        normals[3u * sample + d] = features[sample * sizes.stride + d] + n[d];
+        let before = select(0.0, normals[3u * sample + d], sizes.adds == 1u);
+        normals[3u * sample + d] = before + own_column(sample, d) + n[d];
+    }
+}
+
+// sum_d v_d d/dt dw_c/dt_d: trilinear weights have no pure second derivatives.
+fn weight_second(cell: Cell, corner: u32, v: vec3<f32>) -> vec3<f32> {
+    let upper = vec3((corner & 1u) == 1u, ((corner >> 1u) & 1u) == 1u, (corner >> 2u) == 1u);
+    let w = select(1.0 - cell.t, cell.t, upper);
+    let sign = select(vec3(-1.0), vec3(1.0), upper);
+    let along = sign * v;
+    return sign * vec3(along.y * w.z + w.y * along.z, along.x * w.z + w.x * along.z, along.x * w.y + w.x * along.y);
+}
+
+// What a loss asks of the positions, through the features and through the normals.
+@compute @workgroup_size(64)
+fn position_gradient(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let sample = id.y * groups.x * 64u + id.x;
+    if sample >= sizes.samples {
+        return;
+    }
+    let d_n = normal_of(sample);
+    var sum = vec3(0.0);
+    for (var l = 0u; l < sizes.active_levels; l += 1u) {
+        let at = place_of(sample, l);
+        let scale = 0.5 * vec3<f32>(at.level.cells);
+        for (var c = 0u; c < 8u; c += 1u) {
+            let from_entry = entry(at.level, at.cell, c);
+            var dot_d = 0.0;
+            var dot_g = 0.0;
+            for (var f = 0u; f < sizes.features; f += 1u) {
+                let theta = table[from_entry + f];
+                dot_d += features[at.row + f] * theta;
+                dot_g += gradient[at.row + f] * theta;
+            }
+            sum += scale * (dot_d * weight_gradient(at.cell, c) + dot_g * weight_second(at.cell, c, scale * d_n));
+        }
+    }
+    for (var d = 0u; d < 3u; d += 1u) {
+        d_positions[3u * sample + d] = own_column(sample, d) + sum[d];
     }
 }
 

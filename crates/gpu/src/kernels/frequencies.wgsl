@@ -3,7 +3,7 @@
 
 struct Sizes {
     samples: u32,
-    // Of a position; directions have three.
+    // Of a position; directions, tangents and second derivatives have three.
     coordinates: u32,
     octaves: u32,
     // Row length, and the encoding's first column.
@@ -23,10 +23,14 @@ var<immediate> sizes: Sizes;
 @group(0) @binding(3) var<storage, read> positions: array<f32>;
 // [samples, stride]
 @group(0) @binding(4) var<storage, read_write> encoded: array<f32>;
-// [samples, stride]: `normals` reads derivatives by the encoding, `tangent` writes the tangent.
+// [samples, stride]: `tangent` writes the tangent, the others read derivatives by the encoding.
 @group(0) @binding(5) var<storage, read_write> gradient: array<f32>;
-// [samples, 3]: `normals` writes them, `tangent` reads the vectors.
+// [samples, coordinates]: `normals_of` writes them, `tangent` reads the vectors, `position_gradient` the normals' derivatives.
 @group(0) @binding(6) var<storage, read_write> normals: array<f32>;
+// [samples, stride]: g, of which J^T g are the normals.
+@group(0) @binding(7) var<storage, read> g: array<f32>;
+// [samples, 3]
+@group(0) @binding(8) var<storage, read_write> d_positions: array<f32>;
 
 // x less whole turns. A device's own sine may lose all digits far from zero; the first part of a turn has few enough of them
 // for its multiples to be exact.
@@ -63,19 +67,39 @@ fn of_directions(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_work
     }
 }
 
-// J^T g.
+// A number of J^T g, with g in `gradient`.
+fn transposed(row: u32) -> f32 {
+    var sum = gradient[row];
+    for (var k = 0u; k < sizes.octaves; k += 1u) {
+        let sine = row + sizes.coordinates * (2u * k + 1u);
+        let cosine = sine + sizes.coordinates;
+        sum += f32(1u << k) * (gradient[sine] * encoded[cosine] - gradient[cosine] * encoded[sine]);
+    }
+    return sum;
+}
+
 @compute @workgroup_size(64)
 fn normals_of(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     let thread = id.y * groups.x * 64u + id.x;
+    if thread < sizes.samples * sizes.coordinates {
+        let row = thread / sizes.coordinates * sizes.stride + sizes.first;
+        normals[thread] = transposed(row + thread % sizes.coordinates);
+    }
+}
+
+// What a loss asks of the positions, through the encoding and through the normals.
+@compute @workgroup_size(64)
+fn position_gradient(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let thread = id.y * groups.x * 64u + id.x;
     if thread < sizes.samples * 3u {
         let row = thread / 3u * sizes.stride + sizes.first + thread % 3u;
-        var sum = gradient[row];
+        var second = 0.0;
         for (var k = 0u; k < sizes.octaves; k += 1u) {
             let sine = row + 3u * (2u * k + 1u);
             let cosine = sine + 3u;
-            sum += f32(1u << k) * (gradient[sine] * encoded[cosine] - gradient[cosine] * encoded[sine]);
+            second += f32(1u << (2u * k)) * (g[sine] * encoded[sine] + g[cosine] * encoded[cosine]);
         }
-        normals[thread] = sum;
+        d_positions[thread] = transposed(row) - normals[thread] * second;
     }
 }
 

@@ -42,7 +42,8 @@ var<immediate> sizes: Sizes;
 // [samples]: derivative of the distance. [samples, 8]: derivative of `color`.
 @group(0) @binding(7) var<storage, read_write> d_sdf: array<f32>;
 @group(0) @binding(8) var<storage, read_write> d_color: array<f32>;
-// [rays]: squared error summed over the channels, the other losses, derivative of the sharpness.
+// [rays]: squared error summed over the channels, the other losses, derivative of the sharpness. Behind them, [rays, 2]: what
+// the cosines ask of the ray's origin, nothing, and of its direction.
 @group(0) @binding(9) var<storage, read_write> losses: array<vec4<f32>>;
 // Behind the ball, as in composite.wgsl.
 @group(0) @binding(10) var<storage, read> outer_starts: array<u32>;
@@ -122,6 +123,12 @@ fn eikonal(n: vec3<f32>, weight: f32) -> vec4<f32> {
     return vec4(2.0 * weight * (norm - 1.0) / norm * n, weight * (norm - 1.0) * (norm - 1.0));
 }
 
+fn report(ray: u32, found: vec3<f32>, d_direction: vec3<f32>) {
+    losses[ray] = vec4(found, 0.0);
+    losses[sizes.rays + 2u * ray] = vec4(0.0);
+    losses[sizes.rays + 2u * ray + 1u] = vec4(d_direction, 0.0);
+}
+
 @compute @workgroup_size(64)
 fn losses_of_rays(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     let ray = id.y * groups.x * 64u + id.x;
@@ -186,6 +193,7 @@ fn losses_of_rays(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_wor
         d_outer_color[8u * k + 2u] = d_rgb.z;
     }
     var d_sharpness = 0.0;
+    var d_direction = vec3(0.0);
     for (var i = last; i > first; i -= 1u) {
         let k = i - 1u;
         let s = section_of(k, direction);
@@ -196,8 +204,10 @@ fn losses_of_rays(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_wor
         behind = s.alpha * q + (1.0 - s.alpha) * behind;
         d_sdf[k] = d_alpha * s.by.x;
         d_sharpness += d_alpha * s.by.z;
-        let pull = eikonal(normal_of(k), sizes.eikonal);
+        let n = normal_of(k);
+        let pull = eikonal(n, sizes.eikonal);
         loss += pull.w * f32(sizes.rays);
+        d_direction += d_alpha * s.by.y * n;
         set_normal(k, d_alpha * s.by.y * direction + pull.xyz);
         let d_rgb = d * reach * s.alpha * rgb * (1.0 - rgb);
         for (var c = 0u; c < 8u; c += 1u) {
@@ -207,7 +217,7 @@ fn losses_of_rays(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_wor
         d_color[8u * k + 1u] = d_rgb.y;
         d_color[8u * k + 2u] = d_rgb.z;
     }
-    losses[ray] = vec4(dot(error, error), loss, d_sharpness, 0.0);
+    report(ray, vec3(dot(error, error), loss, d_sharpness), d_direction);
 }
 
 // The eikonal loss at the free points.
@@ -282,6 +292,7 @@ fn losses_of_sections(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num
     // Back to front.
     let d = sign(error) * sizes.scale * share;
     var d_sharpness = 0.0;
+    var d_direction = vec3(0.0);
     while i > first || o > outer_first {
         let k = i - 1u;
         if i > first && (o == outer_first || steps[k].y < 0.0 || steps[k].x > outer_steps[o - 1u].x) {
@@ -301,6 +312,7 @@ fn losses_of_sections(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num
                 behind = s.alpha * q + (1.0 - s.alpha) * behind;
                 d_sdf[k] = d_alpha * s.by.x;
                 d_sharpness += d_alpha * s.by.z;
+                d_direction += d_alpha * s.by.y * n;
                 d_n += d_alpha * s.by.y * direction;
                 d_rgb = d * reach * s.alpha * rgb * (1.0 - rgb);
             }
@@ -329,5 +341,5 @@ fn losses_of_sections(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num
             d_outer_color[8u * o + 2u] = d_rgb.z;
         }
     }
-    losses[ray] = vec4(dot(error, error), loss, d_sharpness, 0.0);
+    report(ray, vec3(dot(error, error), loss, d_sharpness), d_direction);
 }

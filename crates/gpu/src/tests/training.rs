@@ -103,7 +103,7 @@ impl mb_job::Progress for LoseAt {
     }
 }
 
-fn small_neus() -> NeusOptions {
+pub fn small_neus() -> NeusOptions {
     let grid = HashGridOptions { levels: 4, features: 2, log2_entries: 12, coarsest: 8, finest: 64 };
     let mut options = NeusOptions {
         samples_per_step: 1 << 12,
@@ -273,7 +273,7 @@ fn a_checkpoint_of_dvgo_moves_between_devices() {
     assert!((found - expected).abs() < 1e-4 * expected, "{found} is not {expected}");
 }
 
-fn small_nerf_original() -> NerfOriginalOptions {
+pub fn small_nerf_original() -> NerfOriginalOptions {
     let field = FrequencyFieldOptions {
         position_octaves: 4,
         direction_octaves: 2,
@@ -288,7 +288,7 @@ fn small_nerf_original() -> NerfOriginalOptions {
 }
 
 /// A learner that cuts a step into parts of 26 rays, the last one smaller.
-fn gpu_nerf_original(data: &RayDataset, context: &Arc<Context>) -> OnDevice<GpuNerfOriginal> {
+pub fn gpu_nerf_original(data: &RayDataset, context: &Arc<Context>) -> OnDevice<GpuNerfOriginal> {
     let mut gpu = GpuNerfOriginal::new(NerfOriginal::new(small_nerf_original(), data), Arc::clone(context));
     gpu.most_samples = 30 * 24;
     OnDevice(gpu)
@@ -345,7 +345,7 @@ fn training_of_the_original_nerf_follows_the_twin_and_goes_on_from_its_checkpoin
     assert!((next.loss - expected[4]).abs() < 1e-5 * expected[4], "{} is not {}", next.loss, expected[4]);
 }
 
-fn small_neus_original() -> NeusOriginalOptions {
+pub fn small_neus_original() -> NeusOriginalOptions {
     let background = FrequencyFieldOptions {
         position_octaves: 3,
         direction_octaves: 2,
