@@ -1,26 +1,7 @@
 //! The compiled kernels.
 
 use crate::context::{Context, Kernel};
-
-/// Sources, by file name.
-pub const SOURCES: [(&str, &str); 16] = [
-    ("adam", include_str!("kernels/adam.wgsl")),
-    ("composite", include_str!("kernels/composite.wgsl")),
-    ("dense", include_str!("kernels/dense.wgsl")),
-    ("encode", include_str!("kernels/encode.wgsl")),
-    ("field", include_str!("kernels/field.wgsl")),
-    ("frequencies", include_str!("kernels/frequencies.wgsl")),
-    ("gains", include_str!("kernels/gains.wgsl")),
-    ("importance", include_str!("kernels/importance.wgsl")),
-    ("keep", include_str!("kernels/keep.wgsl")),
-    ("march", include_str!("kernels/march.wgsl")),
-    ("ray_gradient", include_str!("kernels/ray_gradient.wgsl")),
-    ("sections", include_str!("kernels/sections.wgsl")),
-    ("skip", include_str!("kernels/skip.wgsl")),
-    ("surface", include_str!("kernels/surface.wgsl")),
-    ("tangent", include_str!("kernels/tangent.wgsl")),
-    ("voxels", include_str!("kernels/voxels.wgsl")),
-];
+use crate::shaders::SOURCES;
 
 /// All entry points. Each has the name that its file gives it, or of what it computes.
 #[allow(missing_docs, reason = "the kernels' own files describe them")]

@@ -52,6 +52,7 @@ mod radiance;
 mod ray_gradients;
 #[cfg(feature = "wgpu")]
 mod rays;
+pub mod shaders;
 #[cfg(feature = "wgpu")]
 mod surface;
 #[cfg(all(test, feature = "wgpu"))]

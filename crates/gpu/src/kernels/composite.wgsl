@@ -1,5 +1,5 @@
 // Compositing, the loss of each ray and the derivatives. Twin: `composite`, `distortion` and `composite_backward`, which
-// explain the formulas. A workgroup for each ray, whose threads take its samples 64 at a time.
+// explain the formulas. A workgroup for each ray, whose threads take its samples 64 at a time (scan.wgsl).
 
 struct Sizes {
     rays: u32,
@@ -52,52 +52,6 @@ fn slope(sigma: f32) -> f32 {
 
 fn rgb_of(i: u32) -> vec3<f32> {
     return 1.0 / (1.0 + exp(-vec3(color[8u * i], color[8u * i + 1u], color[8u * i + 2u])));
-}
-
-// Two lines, of which a scan reads one and writes the other.
-var<workgroup> line: array<vec2<f32>, 128>;
-
-// What comes before a thread's own, and all together.
-struct Scan {
-    before: vec2<f32>,
-    all: vec2<f32>,
-}
-
-// `thread` says where in the line it stands.
-fn sums(thread: u32, own: vec2<f32>) -> Scan {
-    line[thread] = own;
-    workgroupBarrier();
-    var half = 0u;
-    for (var reach = 1u; reach < 64u; reach *= 2u) {
-        var sum = line[half + thread];
-        if thread >= reach {
-            sum += line[half + thread - reach];
-        }
-        half = 64u - half;
-        line[half + thread] = sum;
-        workgroupBarrier();
-    }
-    let found = Scan(select(vec2(0.0), line[half + max(thread, 1u) - 1u], thread > 0u), line[half + 63u]);
-    workgroupBarrier();
-    return found;
-}
-
-fn products(thread: u32, own: f32) -> Scan {
-    line[thread] = vec2(own);
-    workgroupBarrier();
-    var half = 0u;
-    for (var reach = 1u; reach < 64u; reach *= 2u) {
-        var product = line[half + thread];
-        if thread >= reach {
-            product *= line[half + thread - reach];
-        }
-        half = 64u - half;
-        line[half + thread] = product;
-        workgroupBarrier();
-    }
-    let found = Scan(select(vec2(1.0), line[half + max(thread, 1u) - 1u], thread > 0u), line[half + 63u]);
-    workgroupBarrier();
-    return found;
 }
 
 // The light behind the samples that count, and where they end.

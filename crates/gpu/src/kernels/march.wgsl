@@ -1,7 +1,7 @@
 // Samples of rays, wherever the occupancy grid has matter: through contracted space, or inside the unit ball or the cube
 // around it. Twins: `Nerf::march`, `Neus::march` and `Dvgo::march`.
 // `count` runs first; the host adds up the counts and gives each ray its place; `place` writes the samples.
-// A workgroup for each ray: one thread walks 64 steps, all look whether they are worth a sample.
+// A workgroup for each ray: one thread walks 64 steps, all look whether they are worth a sample (scan.wgsl).
 
 // Inside the ball or its cube steps have one length.
 override inside_ball: bool;
@@ -63,26 +63,6 @@ fn unit(p: vec3<f32>) -> vec3<f32> {
 // Distance and length of 64 steps, where the next one begins, and how many samples there are before each.
 var<workgroup> walked: array<vec2<f32>, 64>;
 var<workgroup> ahead: f32;
-var<workgroup> line: array<u32, 128>;
-
-// How many threads before this one have a sample, and how many there are.
-fn ranks(thread: u32, has_sample: bool) -> vec2<u32> {
-    line[thread] = select(0u, 1u, has_sample);
-    workgroupBarrier();
-    var half = 0u;
-    for (var reach = 1u; reach < 64u; reach *= 2u) {
-        var sum = line[half + thread];
-        if thread >= reach {
-            sum += line[half + thread - reach];
-        }
-        half = 64u - half;
-        line[half + thread] = sum;
-        workgroupBarrier();
-    }
-    let found = vec2(select(0u, line[half + max(thread, 1u) - 1u], thread > 0u), line[half + 63u]);
-    workgroupBarrier();
-    return found;
-}
 
 // Walks one ray. With `write`, fills the places up to `last` and returns the first free one.
 fn walk(ray: u32, thread: u32, write: bool, first: u32, last: u32) -> u32 {
@@ -122,8 +102,8 @@ fn walk(ray: u32, thread: u32, write: bool, first: u32, last: u32) -> u32 {
         if voxels && (any(place < vec3(0.0)) || any(place > vec3(1.0))) {
             has_sample = false;
         }
-        let rank = ranks(thread, has_sample);
-        let to = next + rank.x;
+        let rank = sums(thread, vec2(select(0.0, 1.0, has_sample), 0.0));
+        let to = next + u32(rank.before.x);
         if write && has_sample && to < last {
             positions[3u * to] = place.x;
             positions[3u * to + 1u] = place.y;
@@ -131,7 +111,7 @@ fn walk(ray: u32, thread: u32, write: bool, first: u32, last: u32) -> u32 {
             steps[to] = step;
             ray_of[to] = ray;
         }
-        next = min(next + rank.y, last);
+        next = min(next + u32(rank.all.x), last);
     }
     return next;
 }
@@ -163,13 +143,14 @@ fn place(
         return;
     }
     let last = starts[ray + 1u];
-    // A compiler may round the two walks differently; a place that stays free gets a sample without length.
+    // A compiler may round the two walks differently; a place that stays free gets a sample without distance
+    // and length, which asks nothing of its ray.
     let free = walk(ray, thread, true, starts[ray], last);
     for (var i = free + thread; i < last; i += 64u) {
         positions[3u * i] = 0.5;
         positions[3u * i + 1u] = 0.5;
         positions[3u * i + 2u] = 0.5;
-        steps[i] = vec2(sizes.far, 0.0);
+        steps[i] = vec2(0.0, 0.0);
         ray_of[i] = ray;
     }
 }

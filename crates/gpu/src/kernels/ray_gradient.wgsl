@@ -145,10 +145,6 @@ fn add(
     var d_origin = vec3(0.0);
     var d_direction = vec3(0.0);
     for (var i = first + thread; i < last; i += 64u) {
-        // march.wgsl has samples without length, which lie nowhere on the ray.
-        if steps[i].y == 0.0 {
-            continue;
-        }
         let t = steps[i].x;
         let g = scene_gradient(i, origin + t * direction);
         d_origin += g;

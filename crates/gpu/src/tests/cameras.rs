@@ -10,7 +10,7 @@ use mb_neural::neus::Neus;
 use mb_neural::neus_original::NeusOriginal;
 use mb_neural::sdf_field::DirectionEncoding;
 
-use super::training::{gpu_nerf_original, small_nerf_original, small_neus, small_neus_original};
+use super::training::{gpu_nerf_original, small_nerf_original, small_neus, small_neus_original, told_neus};
 use super::*;
 use crate::dvgo::GpuDvgo;
 use crate::nerf::GpuNerf;
@@ -200,24 +200,7 @@ fn neus_moves_cameras_as_its_twin_does() {
     let Some((context, _guard)) = device() else { return };
     for with_masks in [true, false] {
         let data = scene(with_masks);
-        let start = || {
-            let mut twin = Neus::new(small_neus(), &data);
-            // Tables that already say something, a network that hears of them, and a sharper surface.
-            let mut rng = rng(7, 0);
-            let (table, [geometry, _]) = twin.field.parts_mut();
-            table.values.iter_mut().for_each(|v| *v = rng.random_range(-0.05..0.05));
-            let first = geometry.mlp().layout().next();
-            let [weights, _] = geometry.parts_mut();
-            if let Some((inputs, outputs, stride, at, _)) = first {
-                for row in weights.values[at..].chunks_mut(stride).take(inputs) {
-                    row[..outputs].iter_mut().for_each(|v| *v += rng.random_range(-0.3..0.3));
-                }
-            }
-            twin.field.refresh();
-            twin.outside_parameters.table.values.iter_mut().for_each(|v| *v = rng.random_range(-0.5..0.5));
-            twin.sharpness.values[0] = 0.4;
-            twin
-        };
+        let start = || told_neus(&data);
         let gpu = |twin| Box::new(OnDevice(GpuNeus::new(twin, Arc::clone(&context))));
         check_step(&format!("masks {with_masks}"), &data, [&mut start(), gpu(start()).as_mut()], 0, 1e-3);
     }
