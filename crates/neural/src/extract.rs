@@ -108,13 +108,18 @@ pub fn extract(
     Ok(Extracted { mesh, table })
 }
 
-/// Cuts off the plane that the object stands on.
+/// Cuts off the plane that the object stands on, unless nothing would be left.
 fn cut_table(mesh: &mut TriangleMesh, data: &RayDataset, cameras: &CameraResiduals, voxel_mm: f64) -> Option<Table> {
     let centers: Vec<Point3<f64>> =
         data.training().iter().map(|i| cameras.world_from_cam(data, *i).translation().into()).collect();
     let plane = SupportPlane::find(mesh, &centers)?;
     let cut_mm = (CLEARANCE * 1e3 * plane.roughness_m).max(2.0 * voxel_mm);
-    plane.cut(mesh, cut_mm * 1e-3);
+    let mut rest = mesh.clone();
+    plane.cut(&mut rest, cut_mm * 1e-3);
+    if rest.triangles.is_empty() {
+        return None;
+    }
+    *mesh = without_unused_vertices(&rest);
     Some(Table { plane, cut_mm })
 }
 
@@ -336,17 +341,17 @@ mod tests {
         RayDataset::from_images((0..12).map(view).collect(), 0).expect("twelve good views")
     }
 
-    fn extracted(only_object: bool, keep_table: bool) -> Extracted {
+    fn extracted(only_object: bool, keep_table: bool, voxel_mm: f64) -> Extracted {
         let data = data();
         let model = BlockOnTable { radius_m: data.region().radius_m, only_object };
         let cameras = CameraResiduals::new(&CameraOptions::default(), &data);
-        let options = SurfaceOptions { voxel_mm: 2.0, cull: true, keep_table };
+        let options = SurfaceOptions { voxel_mm, cull: true, keep_table };
         extract(&model, &data, &cameras, &options, &Silent).expect("a surface")
     }
 
     #[test]
     fn the_table_is_cut_off_where_there_are_no_masks() {
-        let Extracted { mesh, table } = extracted(false, false);
+        let Extracted { mesh, table } = extracted(false, false, 2.0);
         let table = table.expect("the object stands on something");
         assert!(
             table.plane.normal.z > 0.999 && (table.plane.height(&Point3::origin()) - 0.025).abs() < 5e-4,
@@ -356,9 +361,16 @@ mod tests {
         let bounds = mesh.bounds();
         assert!((bounds.max.coords - Vector3::new(0.03, 0.04, 0.025)).norm() < 1e-3, "{bounds:?}");
         assert!(bounds.min.z > -0.025 + 1e-3 && bounds.min.x > -0.031 && bounds.min.y > -0.041, "{bounds:?}");
-        let kept = extracted(false, true);
+        let kept = extracted(false, true, 2.0);
         assert!(kept.table.is_none() && kept.mesh.bounds().min.x < -0.08, "{:?}", kept.mesh.bounds());
         // What was learned with masks is the object, whatever it looks like.
-        assert_eq!(extracted(true, false), extracted(true, true));
+        assert_eq!(extracted(true, false, 2.0), extracted(true, true, 2.0));
+    }
+
+    #[test]
+    fn a_cut_that_would_leave_nothing_is_not_made() {
+        // Two voxels are more than the block is high.
+        let coarse = extracted(false, false, 27.0);
+        assert!(coarse.table.is_none() && !coarse.mesh.triangles.is_empty(), "{:?}", coarse.table);
     }
 }
